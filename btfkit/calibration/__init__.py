@@ -1,0 +1,1 @@
+"""Radiometric and geometric calibration of captured sequences."""

@@ -1,0 +1,56 @@
+"""What can go wrong, as the caller tells it apart.
+
+    BtfkitError
+    ├── FormatError        a file is not what it says it is
+    ├── DeviceError        a rig refused, failed or fell silent
+    ├── CalibrationError   a measurement cannot be calibrated as it stands
+    └── FitError           a model cannot be fitted to this data
+
+Wrong arguments are ValueError and TypeError, as everywhere in Python.
+"""
+
+from __future__ import annotations
+
+import os
+
+
+class BtfkitError(Exception):
+    """Root of everything btfkit raises by itself.
+
+    Args:
+        message: what was found, where, and what was expected.
+        remedy: what the user can do about it; shown after the message.
+    """
+
+    def __init__(self, message: str, *, remedy: str | None = None) -> None:
+        super().__init__(f"{message}; {remedy}" if remedy else message)
+        self.message = message
+        self.remedy = remedy
+
+
+class FormatError(BtfkitError):
+    """A file is damaged, unsupported or not what it says it is.
+
+    Args:
+        path: the file or folder, or the member inside an archive.
+        message: what was found and what was expected.
+        remedy: what the user can do about it.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], message: str, *, remedy: str | None = None
+    ) -> None:
+        super().__init__(f"{os.fspath(path)}: {message}", remedy=remedy)
+        self.path = os.fspath(path)
+
+
+class DeviceError(BtfkitError):
+    """A device of the rig refused a command, failed or did not answer."""
+
+
+class CalibrationError(BtfkitError):
+    """A sequence lacks what a calibration stage needs, or contradicts itself."""
+
+
+class FitError(BtfkitError):
+    """A model cannot be fitted: no usable data, or training that diverges."""

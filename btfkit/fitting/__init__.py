@@ -1,0 +1,1 @@
+"""Fitting: one trainable a model, and the one training loop. Needs torch."""

@@ -1,0 +1,79 @@
+"""Readers and writers, one module a format, and the native store.
+
+A reader is a module with two functions: `detect(path) -> bool`, which reads no more than
+names and magics, and `read(path, *, ...) -> BTF`, whose textures are decoded when asked for.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import os
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from btfkit.btf import BTF
+from btfkit.errors import FormatError
+
+# The order is the order of detection: the more specific first.
+FORMATS: dict[str, str] = {
+    "zarr": "btfkit.io.store",
+}
+
+
+def format_module(name: str) -> ModuleType:
+    """The reader module of a format name; ValueError lists the names there are."""
+    if name not in FORMATS:
+        raise ValueError(f"no format {name!r}; there are {', '.join(FORMATS)}")
+    return importlib.import_module(FORMATS[name])
+
+
+def detect(path: str | os.PathLike[str]) -> str:
+    """Name of the format that a path looks like.
+
+    Raises:
+        FileNotFoundError: there is nothing at `path`.
+        FormatError: no reader knows it; the message lists the formats.
+    """
+    source = Path(path)
+    if not source.exists():
+        raise FileNotFoundError(f"{source}: no such file or folder")
+    for name in FORMATS:
+        if format_module(name).detect(source):
+            return name
+    raise FormatError(
+        source,
+        f"no reader knows this {'folder' if source.is_dir() else 'file'}",
+        remedy=f"formats are {', '.join(FORMATS)}; name one with --format",
+    )
+
+
+def options_of(name: str) -> tuple[str, ...]:
+    """The keyword options that the reader of a format takes."""
+    parameters = inspect.signature(format_module(name).read).parameters.values()
+    return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
+
+
+def open(path: str | os.PathLike[str], *, format: str | None = None, **options: Any) -> BTF:
+    """A BTF from anything readable; textures are decoded when they are asked for.
+
+    Args:
+        path: store, folder, zip, manifest or file.
+        format: a name of `FORMATS`, where detection should not decide.
+        **options: what the format leaves open, as its reader names them.
+
+    Raises:
+        FileNotFoundError: there is nothing at `path`.
+        FormatError: damaged, or no reader knows it.
+        ValueError: an option that the format does not have.
+    """
+    name = format or detect(path)
+    module = format_module(name)
+    given = {key: value for key, value in options.items() if value is not None}
+    unknown = sorted(given.keys() - set(options_of(name)))
+    if unknown:
+        known = ", ".join(options_of(name)) or "none"
+        raise ValueError(f"format {name} has no option {', '.join(unknown)}; it has {known}")
+    btf: BTF = module.read(Path(path), **given)
+    return btf

@@ -1,0 +1,16 @@
+"""Fitted models as they are used: spec, weights, evaluation. No torch."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+MODELS: dict[str, str] = {}
+
+
+def material_class(model: str) -> Any:
+    """The `Material` class of a model name; ValueError lists the names there are."""
+    if model not in MODELS:
+        raise ValueError(f"no model {model!r}; there are {', '.join(sorted(MODELS))}")
+    module, name = MODELS[model].split(":")
+    return getattr(importlib.import_module(module), name)

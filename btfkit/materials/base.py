@@ -1,0 +1,188 @@
+"""What every fitted model is when it is used: a spec, weights, and answers to queries."""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from btfkit import queries
+from btfkit.btf import QUANTITY, RGB, Wrap
+from btfkit.queries import Query, Response
+
+Array = NDArray[np.float32]
+# Queries are answered in blocks, so that a picture of any size needs bounded memory.
+_BLOCK = 1 << 18
+
+
+@final
+@dataclass(frozen=True)
+class Header:
+    """What a material carries beside its weights.
+
+    Attributes:
+        grid: (h, w) of the data's grid, in which footprints count.
+        channels: one name a channel.
+        wrap: "wrap" where the material tiles, "clamp" where it does not.
+        texel_mm: edge of a texel of the data's grid, None where unknown.
+        licence: that of the data; None where not stated.
+        provenance: source, settings, versions; JSON types only.
+        steps: training steps that led here.
+        quantity: what the answers are.
+    """
+
+    grid: tuple[int, int]
+    channels: tuple[str, ...] = RGB
+    wrap: Wrap = "wrap"
+    texel_mm: float | None = None
+    licence: str | None = None
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    steps: int = 0
+    quantity: str = QUANTITY
+
+    @property
+    def aspect(self) -> float:
+        """Tile width / tile height."""
+        return self.grid[1] / self.grid[0]
+
+
+class Material(ABC):
+    """Answers queries with reflectance and opacity. Immutable; safe to share among threads.
+
+    A model overrides `shapes` and `_answer`, and says by class attributes what it can do.
+
+    Attributes:
+        model: the name in `MODELS`; spec_type: its frozen dataclass.
+        spec: what decides the shapes.
+        weights: arrays by name, as `shapes` lists them.
+        header: what the answers mean and where the material comes from.
+    """
+
+    model: ClassVar[str]
+    spec_type: ClassVar[type]
+    has_levels: ClassVar[bool] = False
+    has_curvature: ClassVar[bool] = False
+    full_sphere: ClassVar[bool] = False
+
+    def __init__(self, spec: Any, weights: Mapping[str, NDArray[Any]], header: Header) -> None:
+        expected = self.shapes(spec, header)
+        found = {name: tuple(array.shape) for name, array in weights.items()}
+        if found != expected:
+            wrong = sorted(
+                f"{name}: {found.get(name, 'missing')} for {expected.get(name, 'nothing')}"
+                for name in found.keys() | expected.keys()
+                if found.get(name) != expected.get(name)
+            )
+            raise ValueError(f"weights do not fit the spec of {self.model}: {'; '.join(wrong)}")
+        self.spec = spec
+        self.weights = dict(weights)
+        self.header = header
+        self._warned: set[str] = set()
+
+    @classmethod
+    @abstractmethod
+    def shapes(cls, spec: Any, header: Header) -> dict[str, tuple[int, ...]]:
+        """Shape of every array of weights for a spec."""
+
+    @abstractmethod
+    def _answer(self, query: Query) -> tuple[Array, Array | None]:
+        """Reflectance (b, c) and opacity (b,), None for opaque, of a flat query.
+
+        uv is reduced to the tile or clamped to it, 0..1; every value is finite, view is above
+        the horizon, and light too unless the model answers for the full sphere.
+        """
+
+    @final
+    def evaluate(
+        self,
+        uv: ArrayLike,
+        light: ArrayLike,
+        view: ArrayLike,
+        footprint: ArrayLike = 0.5,
+        curvature: ArrayLike = 0.0,
+    ) -> Response:
+        """Reflectance and opacity; shapes broadcast.
+
+        Args:
+            uv: (..., 2) u in tile widths along +x, v in tile heights down the rows.
+            light, view: (..., 3) directions away from the surface; normalised here.
+            footprint: (...) standard deviation of the Gaussian kernel, texels of the grid.
+            curvature: (...) along the projected view ray, 1/tile width, positive convex.
+
+        Returns:
+            reflectance (..., c) and opacity (...). Queries that are not finite or seen from
+            below the horizon answer 0 with opacity 0, and a warning counts them. Flat models
+            answer 0 with opacity 1 for lights below the horizon.
+
+        Raises:
+            ValueError: wrong last axes, or shapes that do not broadcast.
+        """
+        query, shape = queries.broadcast(uv, light, view, footprint, curvature)
+        c = len(self.header.channels)
+        rgb = np.zeros((len(query.uv), c), np.float32)
+        opacity = np.zeros(len(query.uv), np.float32)
+        masked = 0
+        for start in range(0, len(query.uv), _BLOCK):
+            block = Query(*(part[start : start + _BLOCK] for part in query))
+            masked += self._answer_block(block, rgb[start:], opacity[start:])
+        if masked:
+            warnings.warn(
+                f"{masked} of {len(query.uv)} queries are not finite or seen from below the "
+                "horizon; they answer 0 with opacity 0",
+                stacklevel=2,
+            )
+        return Response(rgb.reshape(*shape, c), opacity.reshape(shape))
+
+    def _answer_block(self, query: Query, rgb: Array, opacity: Array) -> int:
+        """Answer one block into the heads of `rgb` and `opacity`; returns how many are masked."""
+        light, light_ok = _unit(query.light)
+        view, view_ok = _unit(query.view)
+        good = light_ok & view_ok & (view[:, 2] >= 0)
+        good &= np.isfinite(query.uv).all(axis=1)
+        good &= np.isfinite(query.footprint) & np.isfinite(query.curvature)
+        masked = int(len(good) - good.sum())
+        self._warn_of_missing_parts(query, good)
+        rows = np.flatnonzero(good)
+        opacity[rows] = 1.0
+        if not self.full_sphere:
+            rows = np.flatnonzero(good & (light[:, 2] > 0))
+        if rows.size:
+            uv = query.uv[rows]
+            uv = uv - np.floor(uv) if self.header.wrap == "wrap" else np.clip(uv, 0.0, 1.0)
+            values, cover = self._answer(
+                Query(
+                    uv.astype(np.float32),
+                    light[rows],
+                    view[rows],
+                    np.maximum(query.footprint[rows], 0.0),
+                    query.curvature[rows],
+                )
+            )
+            if cover is not None:
+                opacity[rows] = cover
+                values = np.where(cover[:, None] > 0, values, 0.0)
+            rgb[rows] = values
+        return masked
+
+    def _warn_of_missing_parts(self, query: Query, good: NDArray[np.bool_]) -> None:
+        for part, has, neutral in (
+            ("footprint", self.has_levels, query.footprint <= 0.5),
+            ("curvature", self.has_curvature, query.curvature == 0),
+        ):
+            if not has and part not in self._warned and not np.all(neutral | ~good):
+                self._warned.add(part)
+                what = "at its finest level" if part == "footprint" else "on the plane"
+                warnings.warn(f"{self.model} knows no {part}: it answers {what}", stacklevel=4)
+
+
+def _unit(direction: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Unit vectors (b, 3) float32, and (b,) whether there was a direction to normalise."""
+    length = np.linalg.norm(direction.astype(np.float64), axis=1)
+    good = np.isfinite(length) & (length > 1e-30)
+    unit = direction / np.where(good, length, 1.0)[:, None]
+    return unit.astype(np.float32), good

@@ -1,0 +1,135 @@
+"""Material files: safetensors whose header says what the numbers mean."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from btfkit.errors import FormatError
+from btfkit.files import whole
+from btfkit.materials import MODELS, material_class
+from btfkit.materials.base import Header, Material
+
+VERSION = 1
+# Arrays that only the fitting side reads (a NeuBTF's encoder) carry this prefix.
+TRAINING = "training."
+
+
+def save(
+    material: Material,
+    path: str | os.PathLike[str],
+    *,
+    training: Mapping[str, NDArray[Any]] | None = None,
+    force: bool = False,
+) -> None:
+    """Write a material; the file appears whole under its name or not at all.
+
+    Args:
+        material: what to write.
+        path: file to write, `*.safetensors`.
+        training: further arrays that only fitting and propagation read, by name.
+        force: whether an existing file is replaced.
+
+    Raises:
+        FileExistsError: `path` exists and `force` is False.
+    """
+    header = asdict(material.header)
+    metadata = {
+        "btfkit": str(VERSION),
+        "model": material.model,
+        "spec": json.dumps(asdict(material.spec)),
+        **{name: json.dumps(value) for name, value in header.items()},
+    }
+    arrays = {name: np.ascontiguousarray(value) for name, value in material.weights.items()}
+    for name, value in (training or {}).items():
+        arrays[TRAINING + name] = np.ascontiguousarray(value)
+    with whole(path, force=force) as partial:
+        save_file(arrays, partial, metadata)
+
+
+def load(path: str | os.PathLike[str]) -> Material:
+    """The material in a file; needs no torch.
+
+    Raises:
+        FormatError: the file is damaged, of a newer version, or of an unknown model.
+    """
+    arrays, metadata = _read(path, want=lambda name: not name.startswith(TRAINING))
+    try:
+        model = metadata["model"]
+        if model not in MODELS:
+            known = ", ".join(sorted(MODELS))
+            raise FormatError(path, f"model {model!r}; this version knows {known}")
+        kind = material_class(model)
+        spec = kind.spec_type(**_tuples(json.loads(metadata["spec"])))
+        fields = {name: json.loads(metadata[name]) for name in Header.__dataclass_fields__}
+        return kind(spec, arrays, Header(**_tuples(fields)))
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(path, f"the header does not describe a material: {error}") from error
+
+
+def training_arrays(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
+    """The arrays beside a material that only fitting and propagation read, by name."""
+    arrays, _ = _read(path, want=lambda name: name.startswith(TRAINING))
+    return {name.removeprefix(TRAINING): value for name, value in arrays.items()}
+
+
+def header_of(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """What the header says, decoded, without reading an array; sizes by array name added."""
+    with _opened(path) as file:
+        metadata = _checked_metadata(path, file.metadata())
+        shapes = {name: file.get_slice(name).get_shape() for name in file.keys()}  # noqa: SIM118
+    decoded: dict[str, Any] = {"model": metadata["model"], "shapes": shapes}
+    for name in ("spec", *Header.__dataclass_fields__):
+        if name in metadata:
+            decoded[name] = json.loads(metadata[name])
+    return decoded
+
+
+def _opened(path: str | os.PathLike[str]) -> Any:
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{os.fspath(path)}: no such file")
+    try:
+        return safe_open(os.fspath(path), framework="numpy")
+    except (SafetensorError, OSError, ValueError) as error:
+        raise FormatError(
+            path, f"not a readable safetensors file ({error})", remedy="fit or copy it again"
+        ) from error
+
+
+def _read(path: str | os.PathLike[str], *, want: Any) -> tuple[dict[str, Any], dict[str, str]]:
+    with _opened(path) as file:
+        metadata = _checked_metadata(path, file.metadata())
+        try:
+            arrays = {name: file.get_tensor(name) for name in file.keys() if want(name)}  # noqa: SIM118
+        except (SafetensorError, OSError, ValueError, TypeError) as error:
+            raise FormatError(path, f"an array cannot be read ({error})") from error
+    bad = sorted(n for n, a in arrays.items() if a.dtype.kind == "f" and not np.isfinite(a).all())
+    if bad:
+        raise FormatError(path, f"{bad[0]} holds values that are not finite")
+    return arrays, metadata
+
+
+def _checked_metadata(
+    path: str | os.PathLike[str], metadata: Mapping[str, str] | None
+) -> dict[str, str]:
+    if not metadata or "model" not in metadata or not metadata.get("btfkit", "").isdigit():
+        raise FormatError(path, "a safetensors file, but not a btfkit material")
+    if int(metadata["btfkit"]) > VERSION:
+        raise FormatError(
+            path, f"file version {metadata['btfkit']}; this version reads up to {VERSION}"
+        )
+    return dict(metadata)
+
+
+def _tuples(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON has lists where specs and headers have tuples."""
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}

@@ -1,0 +1,37 @@
+"""C++ kernels behind Python faces, each with the plain numpy twin it is tested against.
+
+A kernel `name` is one file `name.cpp`, built as the extension `btfkit.native._name`.
+Its face is `name.py`: the same function twice, `..._plain` in numpy and, where the
+extension was built, the compiled one. `BTFKIT_PLAIN=1` chooses the twins.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from types import ModuleType
+
+KERNELS: tuple[str, ...] = ()
+
+
+def load(name: str) -> ModuleType | None:
+    """The compiled kernel `name`, or None where it was not built or twins are asked for."""
+    if os.environ.get("BTFKIT_PLAIN", "") not in ("", "0"):
+        return None
+    try:
+        return importlib.import_module(f"btfkit.native._{name}")
+    except ImportError:
+        return None
+
+
+def threads() -> int:
+    """Threads that kernels use: BTFKIT_THREADS, or the processors this process may run on."""
+    asked = os.environ.get("BTFKIT_THREADS", "")
+    if asked.isdigit() and int(asked) > 0:
+        return int(asked)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def in_use() -> dict[str, str]:
+    """Which form of every kernel runs: "compiled" or "plain"."""
+    return {name: "plain" if load(name) is None else "compiled" for name in KERNELS}

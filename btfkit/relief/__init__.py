@@ -1,0 +1,1 @@
+"""Microgeometry: reliefs, procedural materials, and the tracer that turns them into BTFs."""

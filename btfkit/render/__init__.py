@@ -1,0 +1,1 @@
+"""Pictures of a material on simple shapes."""

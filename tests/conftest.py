@@ -1,0 +1,22 @@
+"""What every test file shares: tolerances with reasons, strategies, real data."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+# Machines are shared: a deadline would test the neighbours.
+hypothesis.settings.register_profile("btfkit", deadline=None, max_examples=50)
+hypothesis.settings.load_profile("btfkit")
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real measurements; the test skips where there is none."""
+    folder = os.environ.get("BTFKIT_REAL_DATA")
+    if not folder:
+        pytest.skip("BTFKIT_REAL_DATA names no folder of real measurements")
+    return Path(folder)
