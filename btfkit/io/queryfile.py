@@ -1,0 +1,96 @@
+"""Query files: `.npz` of float32 arrays, never pickled."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit.errors import FormatError
+from btfkit.files import whole
+from btfkit.queries import QuerySet
+
+_ARRAYS = ("uv", "light", "view", "footprint", "curvature", "rgb", "opacity", "weight")
+# A million queries are 50 MB; a file that says it unpacks to more than this is hostile.
+_MOST_BYTES = 1 << 36
+
+
+def detect(path: Path) -> bool:
+    """Whether `path` is an .npz with the arrays of a query file; reads names only."""
+    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return {"uv.npy", "light.npy", "view.npy"} <= set(archive.namelist())
+
+
+def read(path: Path) -> QuerySet:
+    """The queries in a file, with the answers it holds.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        FormatError: damaged, pickled, or arrays that do not fit each other.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            declared = sum(member.file_size for member in archive.infolist())
+        if declared > _MOST_BYTES:
+            raise FormatError(path, f"says it unpacks to {declared} bytes")
+        with np.load(path, allow_pickle=False) as file:
+            found = {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, EOFError, KeyError, MemoryError, zipfile.BadZipFile) as error:
+        raise FormatError(
+            path, f"not a readable query file ({error})", remedy="write it with numpy.savez"
+        ) from error
+    missing = [name for name in ("uv", "light", "view") if name not in found]
+    if missing:
+        raise FormatError(path, f"no array {', '.join(missing)}; it has {', '.join(found)}")
+    return _queries(path, found)
+
+
+def _queries(path: Path, found: dict[str, NDArray[Any]]) -> QuerySet:
+    arrays: dict[str, Any] = {name: found[name] for name in _ARRAYS if name in found}
+    wrong = [name for name, array in arrays.items() if array.dtype.kind not in "fiu"]
+    if wrong:
+        raise FormatError(path, f"{wrong[0]} is {arrays[wrong[0]].dtype}; expected float32")
+    try:
+        if "size" in found:
+            h, w = (int(value) for value in found["size"].reshape(-1))
+            arrays["size"] = (h, w)
+        if "rgb" in arrays:
+            arrays["channels"] = _channels(found, arrays["rgb"].shape[-1])
+        if "provenance" in found:
+            arrays["provenance"] = json.loads(str(found["provenance"]))
+        return QuerySet(**arrays)
+    except ValueError as error:
+        raise FormatError(path, str(error)) from error
+
+
+def _channels(found: dict[str, NDArray[Any]], count: int) -> tuple[str, ...]:
+    if "channels" in found:
+        return tuple(str(name) for name in found["channels"])
+    return ("R", "G", "B") if count == 3 else tuple(f"C{index}" for index in range(count))
+
+
+def write(queries: QuerySet, path: str | os.PathLike[str], *, force: bool = False) -> None:
+    """Write a query file; it appears whole under its name or not at all.
+
+    Raises:
+        FileExistsError: `path` exists and `force` is False.
+    """
+    arrays = {name: getattr(queries, name) for name in _ARRAYS}
+    given: dict[str, Any] = {name: value for name, value in arrays.items() if value is not None}
+    if queries.size is not None:
+        given["size"] = np.asarray(queries.size, np.int64)
+    if queries.rgb is not None:
+        given["channels"] = np.asarray(queries.channels)
+    if queries.provenance:
+        given["provenance"] = np.asarray(json.dumps(dict(queries.provenance)))
+    with whole(path, force=force) as partial:
+        np.savez(partial, **given)
