@@ -76,6 +76,7 @@ def test_a_masked_texel_is_nan_and_a_nan_texel_stays_one(tmp_path: Path) -> None
         np.isnan(back.texture(1)[..., 0]), [[False, True], [False, False]]
     )
     assert np.isnan(back.texels([0, 1], [0, 0], [1, 1])).all()
+    assert zarr.open_group(tmp_path / "a.btf.zarr", mode="r").attrs["masked_texels"] == 1
 
 
 def test_values_past_half_range_make_a_float32_store(tmp_path: Path) -> None:

@@ -1,1 +1,59 @@
-"""The command line: one module a verb."""
+"""The command line: one module a verb, loaded when it is asked for."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import click
+
+# Verb -> module with a function of the verb's name, and the line that `btfkit --help` shows.
+VERBS: dict[str, tuple[str, str]] = {
+    "ingest": ("btfkit.cli.ingest", "Read any measured source into one native store."),
+    "convert": ("btfkit.cli.convert", "Write a store in an interchange format."),
+    "fit": ("btfkit.cli.fit", "Fit a model to a BTF, a relief or a query file."),
+    "propagate": ("btfkit.cli.propagate", "Carry a fitted NeuBTF onto a guidance image."),
+    "tile": ("btfkit.cli.tile", "Make an image, a BTF or a NeuBTF tile."),
+    "eval": ("btfkit.cli.eval", "Errors of a model on a BTF or a query file."),
+    "query": ("btfkit.cli.query", "Answer a query file with a model."),
+    "render": ("btfkit.cli.render", "A picture of a material on a simple shape."),
+    "synth": ("btfkit.cli.synth", "Make a procedural material with known relief."),
+    "info": ("btfkit.cli.info", "What a file is; without a path: versions and kernels."),
+}
+
+
+class _Verbs(click.Group):
+    """A group that knows its verbs by name and imports one when it is used."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(VERBS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in VERBS:
+            return None
+        module = importlib.import_module(VERBS[cmd_name][0])
+        command: click.Command = getattr(module, f"{cmd_name}_verb")
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Verbs"):
+            formatter.write_dl([(name, line) for name, (_, line) in VERBS.items()])
+
+
+@click.group(cls=_Verbs, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="btfkit", prog_name="btfkit")
+def btfkit() -> None:
+    """Measured materials, from photographs to neural materials in a renderer.
+
+    \b
+    btfkit ingest folder
+    btfkit fit --model neubtf
+    btfkit propagate guidance.png
+    """  # noqa: D301
+
+
+def main() -> None:
+    """Entry point of the `btfkit` command."""
+    from btfkit.cli.outcome import run
+
+    sys.exit(run(btfkit, sys.argv[1:]))

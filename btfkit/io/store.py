@@ -2,7 +2,8 @@
 
     texture (n, h, w, c) float16 or float32, one chunk a texture, sharded by a run of pairs
     light, view (n, 3) float32            optional: light_position, view_position (n, 3) mm,
-    validity, variance, footprint         attributes: what `BTF` says about itself
+    validity, variance, footprint         attributes: what `BTF` says about itself,
+                                          and masked_texels, how many texels are NaN
 
 Every chunk is compressed and carries a CRC32C, so a damaged one is told, never answered.
 """

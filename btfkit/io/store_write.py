@@ -154,23 +154,30 @@ class _Job:
 
     def write(self, run: range) -> int:
         """Decode and write one shard of every image array, then note it."""
+        masked = 0
         for name, (textures, array) in self.images.items():
             block = np.empty((len(run), *textures.shape[1:]), array.dtype)
             for slot, pair in enumerate(run):
                 image = textures[pair]
-                if array.dtype == np.float16 and np.abs(image).max(initial=0.0) > _HALF_LIMIT:
+                finite = np.isfinite(image)
+                if name == "texture":
+                    masked += int((~finite).any(axis=-1).sum())
+                largest = np.abs(image).max(initial=0.0, where=finite)
+                if array.dtype == np.float16 and largest > _HALF_LIMIT:
                     raise HalfRangeError(
-                        f"pair {pair} holds {np.abs(image).max():.6g}; float16 ends at 6e4",
+                        f"pair {pair} holds {largest:.6g}; float16 ends at 6e4",
                         remedy="write float32",
                     )
-                block[slot] = image
+                block[slot] = np.where(finite, image, np.nan)
             array[run.start : run.stop] = block
             _sync(shard_path(self.folder / name, run.start // self.run))
-        _append(self.folder, {"shard": run.start // self.run})
+        _append(self.folder, {"shard": run.start // self.run, "masked": masked})
         return len(run)
 
     def finish(self, final: Path) -> None:
-        """Drop the journal and give the store its name."""
+        """Note how many texels are masked, drop the journal and give the store its name."""
+        masked = sum(entry["masked"] for entry in _journal(self.folder)[1:])
+        zarr.open_group(self.folder, mode="r+", zarr_format=3).attrs["masked_texels"] = masked
         (self.folder / _JOURNAL).unlink()
         replace_folder(self.folder, final)
 

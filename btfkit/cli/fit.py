@@ -1,0 +1,90 @@
+"""`btfkit fit`: a BTF, a relief or a query file -> a material."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from btfkit.cli.bar import Bar
+from btfkit.cli.options import (
+    DurationType,
+    SettingType,
+    force_option,
+    out_option,
+    seed_option,
+    stem,
+    the_only,
+)
+from btfkit.cli.outcome import Outcome, verb
+
+
+@verb("fit", example="btfkit fit wool.btf.zarr --model neubtf --budget 10m")
+@click.argument("source", required=False, type=click.Path(path_type=Path))
+@click.option("--model", default="auto", show_default=True, help="Name of a model, or auto.")
+@out_option("The model file; by default SOURCE.MODEL.safetensors here")
+@click.option(
+    "--budget",
+    type=DurationType(),
+    default="5m",
+    show_default=True,
+    help="Wall time of the training alone.",
+)
+@click.option("--steps", type=click.IntRange(min=0), help="Train this many steps instead.")
+@click.option(
+    "--holdout",
+    type=click.FloatRange(0, 1, max_open=True),
+    default=0.05,
+    show_default=True,
+    help="Share of the direction pairs (or query rows) kept for the test.",
+)
+@click.option(
+    "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True
+)
+@click.option("--resume", is_flag=True, help="Go on with an interrupted fit of the same output.")
+@click.option("--set", "settings", type=SettingType(), multiple=True, help="A model's setting.")
+@seed_option
+@force_option
+def fit_verb(
+    bar: Bar,
+    *,
+    source: Path | None,
+    model: str,
+    out: Path | None,
+    budget: float,
+    steps: int | None,
+    holdout: float,
+    device: str,
+    resume: bool,
+    settings: tuple[tuple[str, str], ...],
+    seed: int,
+    force: bool,
+) -> Outcome:
+    """Fit a model to SOURCE; without SOURCE, to the only store in this folder.
+
+    SOURCE: a native store, anything `btfkit ingest` reads, a relief file or a query file.
+    Writes the model and OUT.report.json beside it. Ctrl-C keeps the best state so far.
+    """
+    from btfkit.cli.sources import read_source
+    from btfkit.fitting import MODELS, fit
+
+    if model != "auto" and model not in MODELS:
+        raise ValueError(f"no model {model!r}; there are auto, {', '.join(MODELS)}")
+    path = source or the_only(
+        Path().glob("*.btf.zarr"), what="stores", remedy="name one: btfkit fit STORE"
+    )
+    report = fit(
+        read_source(path),
+        model=model,
+        budget_s=budget,
+        steps=steps,
+        holdout=holdout,
+        seed=seed,
+        device=device,
+        out=out or Path(f"{stem(path)}.{model}.safetensors"),
+        resume=resume,
+        settings=dict(settings),
+        progress=bar,
+        force=force,
+    )
+    return Outcome(report.line(), report.as_dict())

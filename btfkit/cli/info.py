@@ -1,0 +1,147 @@
+"""`btfkit info`: what a file is, or what this installation has."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from btfkit.cli.bar import Bar
+from btfkit.cli.outcome import Outcome, plain, verb
+
+_LIBRARIES = (
+    "torch",
+    "kornia",
+    "opencv-contrib-python-headless",
+    "scikit-image",
+    "colour-science",
+    "OpenImageIO",
+    "pyusb",
+    "zarr",
+    "numpy",
+)
+
+
+@verb("info", example="btfkit info wool.btf.zarr")
+@click.argument("path", required=False, type=click.Path(path_type=Path))
+def info_verb(bar: Bar, *, path: Path | None) -> Outcome:
+    """What PATH is: sizes, directions, quantity, colour, provenance, licence.
+
+    Without PATH: versions, devices, formats, models and the kernels in use.
+    """
+    data = installation() if path is None else described(path)
+    return Outcome(_listing(plain(data)), data)
+
+
+def installation() -> dict[str, Any]:
+    """Versions, processors, formats, models and kernels of this installation."""
+    from btfkit import native
+    from btfkit.fitting import MODELS
+    from btfkit.io import FORMATS
+
+    return {
+        "btfkit": importlib.metadata.version("btfkit"),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processors": os.cpu_count(),
+        "threads": native.threads(),
+        "cuda": _cuda(),
+        "kernels": native.in_use(),
+        "formats": list(FORMATS),
+        "models": list(MODELS),
+        "libraries": {name: _version(name) for name in _LIBRARIES},
+    }
+
+
+def described(path: Path) -> dict[str, Any]:
+    """What a store, a readable source, a model, a relief or a query file says of itself."""
+    from btfkit.btf import BTF
+    from btfkit.cli.sources import read_source
+    from btfkit.queries import QuerySet
+
+    if path.suffix == ".safetensors":
+        from btfkit.materials.file import header_of
+
+        return {"kind": "model", "bytes": path.stat().st_size, **header_of(path)}
+    found = read_source(path)
+    if isinstance(found, BTF):
+        return {"kind": "btf", "path": path, **_of_btf(found)}
+    if isinstance(found, QuerySet):
+        return {"kind": "queries", "path": path, **_of_queries(found)}
+    h, w = found.height.shape
+    return {
+        "kind": "relief",
+        "path": path,
+        "size": (h, w),
+        "height": (float(np.nanmin(found.height)), float(np.nanmax(found.height))),
+        "texel_mm": found.texel_mm,
+        "wrap": found.wrap,
+    }
+
+
+def _of_btf(btf: Any) -> dict[str, Any]:
+    from btfkit import directions
+    from btfkit.btf import QUANTITY
+
+    lights, _ = directions.unique(btf.light)
+    views, _ = directions.unique(btf.view)
+    return {
+        "shape": btf.shape,
+        "lights": len(lights),
+        "views": len(views),
+        "steepest_light_deg": float(np.degrees(np.arccos(lights[:, 2].min()))),
+        "steepest_view_deg": float(np.degrees(np.arccos(views[:, 2].min()))),
+        "near_field": btf.light_position is not None or btf.view_position is not None,
+        "quantity": QUANTITY,
+        "colour": btf.colour,
+        "channels": btf.channels,
+        "texel_mm": btf.texel_mm,
+        "wrap": btf.wrap,
+        "licence": btf.licence,
+        "provenance": dict(btf.provenance),
+        "history": btf.history,
+    }
+
+
+def _of_queries(queries: Any) -> dict[str, Any]:
+    valid = queries.valid()
+    return {
+        "rows": len(queries),
+        "masked": int((~valid).sum()),
+        "answers": queries.rgb is not None,
+        "opacity": queries.opacity is not None,
+        "footprints": queries.footprint is not None,
+        "curvatures": queries.curvature is not None,
+        "size": queries.size,
+        "channels": queries.channels,
+    }
+
+
+def _version(library: str) -> str:
+    try:
+        return importlib.metadata.version(library)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _cuda() -> str:
+    from btfkit.fitting import cuda_device
+
+    return cuda_device()
+
+
+def _listing(data: Mapping[str, Any], indent: str = "") -> str:
+    lines = []
+    for key, value in data.items():
+        if isinstance(value, Mapping) and value:
+            lines += [f"{indent}{key}", _listing(value, indent + "  ")]
+        else:
+            shown = ", ".join(map(str, value)) if isinstance(value, list) else value
+            lines.append(f"{indent}{key:<20} {shown}")
+    return "\n".join(lines)

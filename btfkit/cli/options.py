@@ -1,0 +1,141 @@
+"""Values of options that several verbs share, and the one file that goes without saying."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, final
+
+import click
+
+from btfkit.errors import BtfkitError
+
+
+@final
+class SliceType(click.ParamType[slice]):
+    """`A:B:S` as a slice."""
+
+    name = "A:B:S"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> slice:
+        if isinstance(value, slice):
+            return value
+        parts = str(value).split(":")
+        if len(parts) > 3 or not all(re.fullmatch(r"-?\d*", part) for part in parts):
+            self.fail(f"{value!r} is no slice; expected A:B or A:B:S", param, ctx)
+        numbers = [int(part) if part not in ("", "-") else None for part in parts]
+        if len(numbers) == 1 and numbers[0] is not None:
+            stop = numbers[0] + 1
+            return slice(numbers[0], stop if stop else None)
+        if numbers[2:] == [0]:
+            self.fail(f"{value!r} has step 0", param, ctx)
+        return slice(*numbers)
+
+
+@final
+class WindowType(click.ParamType[tuple[slice, slice]]):
+    """`R0:R1,C0:C1` as a pair of slices."""
+
+    name = "R0:R1,C0:C1"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[slice, slice]:
+        if isinstance(value, tuple):
+            return value
+        match = re.fullmatch(r"(\d*):(\d*),(\d*):(\d*)", str(value))
+        if not match:
+            self.fail(f"{value!r} is no window; expected R0:R1,C0:C1", param, ctx)
+        r0, r1, c0, c1 = (int(part) if part else None for part in match.groups())
+        return slice(r0, r1), slice(c0, c1)
+
+
+@final
+class NumbersType(click.ParamType[tuple[Any, ...]]):
+    """Numbers between commas (or an x), a fixed count of them."""
+
+    def __init__(self, name: str, kind: type, separator: str = ",") -> None:
+        self.name = name
+        self._kind, self._separator = kind, separator
+        self._count = len(name.split(separator))
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[Any, ...]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            numbers = tuple(self._kind(part) for part in str(value).split(self._separator))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != self._count:
+            self.fail(f"{value!r}; expected {self.name}", param, ctx)
+        return numbers
+
+
+@final
+class DurationType(click.ParamType[float]):
+    """`60s`, `5m`, `1.5h` or plain seconds, as seconds."""
+
+    name = "60s|5m"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        if isinstance(value, float):
+            return value
+        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|h|)", str(value))
+        seconds = float(match[1]) * {"s": 1, "": 1, "m": 60, "h": 3600}[match[2]] if match else 0
+        if seconds <= 0:
+            self.fail(f"{value!r} is no time; expected like 60s or 5m", param, ctx)
+        return seconds
+
+
+@final
+class SettingType(click.ParamType[tuple[str, str]]):
+    """`key=value` as a pair."""
+
+    name = "key=value"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, str]:
+        if isinstance(value, tuple):
+            return value
+        key, equals, setting = str(value).partition("=")
+        if not equals or not key:
+            self.fail(f"{value!r}; expected key=value", param, ctx)
+        return key, setting
+
+
+def out_option(what: str) -> Callable[..., Any]:
+    """The `-o OUT` option of a verb."""
+    return click.option("-o", "--out", type=click.Path(path_type=Path), help=f"{what}.")
+
+
+force_option = click.option("--force", is_flag=True, help="Replace an existing output.")
+seed_option = click.option("--seed", type=int, default=0, show_default=True, help="Repeat a run.")
+
+
+def the_only(found: Iterable[Path], *, what: str, remedy: str) -> Path:
+    """The one path of `found`; with none or several, an error that lists them.
+
+    Raises:
+        BtfkitError: not exactly one.
+    """
+    paths = sorted(found)
+    if len(paths) == 1:
+        return paths[0]
+    listing = ", ".join(path.name for path in paths) or "none"
+    raise BtfkitError(f"{what} in this folder: {listing}; expected exactly one", remedy=remedy)
+
+
+def stem(path: Path) -> str:
+    """Name of a source without what the toolkit or its format appends."""
+    name = path.resolve().name
+    for suffix in (".btf.zarr", ".safetensors", *path.suffixes[-1:]):
+        name = name.removesuffix(suffix)
+    return name

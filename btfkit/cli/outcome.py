@@ -1,0 +1,156 @@
+"""How every verb ends: a line or one JSON object, an error line, an exit code."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, final
+
+import click
+
+from btfkit.cli.bar import Bar
+
+DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+
+
+@final
+@dataclass(frozen=True)
+class Outcome:
+    """What a verb has to say when it is done.
+
+    Attributes:
+        line: for people; may span lines.
+        data: for scripts: results, figures, output paths.
+    """
+
+    line: str
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
+@final
+@dataclass
+class _Manners:
+    """The options that every verb has."""
+
+    as_json: bool = False
+    quiet: bool = False
+    debug: bool = False
+
+
+_manners = _Manners()
+
+
+def verb(name: str, *, example: str) -> Callable[[Callable[..., Outcome]], click.Command]:
+    """Make a verb of a function that takes a `Bar` and its options, and returns an `Outcome`.
+
+    Args:
+        name: the verb.
+        example: command lines that `--help` shows.
+    """
+
+    def decorate(function: Callable[..., Outcome]) -> click.Command:
+        @functools.wraps(function)
+        def call(*, as_json: bool, quiet: bool, debug: bool, **options: Any) -> None:
+            _manners.as_json, _manners.quiet, _manners.debug = as_json, quiet, debug
+            with warnings.catch_warnings(record=True) as caught, Bar(name, quiet=quiet) as bar:
+                warnings.simplefilter("always", UserWarning)
+                outcome = function(bar, **options)
+            _say(outcome, sorted({str(w.message) for w in caught if _is_ours(w)}))
+
+        for option in (
+            click.option("--debug", is_flag=True, help="Show a traceback on failure."),
+            click.option("--quiet", is_flag=True, help="No progress, no warnings."),
+            click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout."),
+        ):
+            call = option(call)
+        help_text = (function.__doc__ or "") + "\n\nExample:\n\n\b\n" + example
+        return click.command(name, help=help_text)(call)
+
+    return decorate
+
+
+def run(group: click.Group, arguments: Sequence[str]) -> int:
+    """Run the command line; returns the exit code."""
+    _manners.as_json = "--json" in arguments
+    _manners.debug = "--debug" in arguments
+    try:
+        group.main(list(arguments), prog_name="btfkit", standalone_mode=False)
+        sys.stdout.flush()
+    except click.exceptions.Exit as ending:
+        return ending.exit_code
+    except click.UsageError as error:
+        if _manners.as_json:
+            _print_json({"error": {"type": "usage", "message": error.format_message()}})
+        error.show()
+        return WRONG_USAGE
+    except (KeyboardInterrupt, click.Abort):
+        return _failed("Interrupted", "interrupted; what was finished is kept", INTERRUPTED)
+    except BrokenPipeError:
+        # Whoever read our output has left: no more to say, and nothing to flush at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except Exception as error:  # the last place that can answer for it
+        return _failed(type(error).__name__, _message(error), FAILED)
+    return DONE
+
+
+def _message(error: Exception) -> str:
+    from btfkit.errors import BtfkitError
+
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, (BtfkitError, OSError, ValueError, TypeError, ModuleNotFoundError)):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return f"out of memory ({error})"
+    return f"{type(error).__name__}: {error} (a fault in btfkit; --debug shows where)"
+
+
+def _failed(kind: str, message: str, code: int) -> int:
+    if _manners.debug:
+        traceback.print_exc()
+    if _manners.as_json:
+        _print_json({"error": {"type": kind, "message": message}})
+    print(f"btfkit: error: {' '.join(message.split())}", file=sys.stderr)  # noqa: T201
+    return code
+
+
+def _is_ours(warning: warnings.WarningMessage) -> bool:
+    return issubclass(warning.category, UserWarning) and "btfkit" in Path(warning.filename).parts
+
+
+def _say(outcome: Outcome, warned: list[str]) -> None:
+    if not _manners.quiet:
+        for message in warned:
+            print(f"btfkit: warning: {message}", file=sys.stderr)  # noqa: T201
+    if _manners.as_json:
+        _print_json({**outcome.data, **({"warnings": warned} if warned else {})})
+    else:
+        click.echo(outcome.line)
+
+
+def _print_json(data: Mapping[str, Any]) -> None:
+    click.echo(json.dumps(plain(data), allow_nan=False))
+
+
+def plain(value: Any) -> Any:
+    """`value` in JSON's own types: paths as text, arrays as lists, non-finite numbers as text."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return "nan" if math.isnan(value) else ("inf" if value > 0 else "-inf")
+    return value

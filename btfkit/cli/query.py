@@ -1,0 +1,44 @@
+"""`btfkit query`: a model and questions -> answers."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import click
+
+from btfkit.cli.bar import Bar
+from btfkit.cli.options import force_option
+from btfkit.cli.outcome import Outcome, verb
+
+
+@verb("query", example="btfkit query wool.neubtf.safetensors queries.npz -o answers.npz")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("queries", type=click.Path(path_type=Path))
+@click.option("-o", "--out", required=True, type=click.Path(path_type=Path), help="To write.")
+@force_option
+def query_verb(bar: Bar, *, model: Path, queries: Path, out: Path, force: bool) -> Outcome:
+    """Evaluate MODEL on a query file; OUT holds the queries with `rgb` and `opacity` added."""
+    from btfkit.cli.sources import material_of
+    from btfkit.files import refuse_existing
+    from btfkit.io import queryfile
+
+    refuse_existing(out, force=force)
+    material, asked = material_of(model), queryfile.read(queries)
+    bar(0, len(asked))
+    start = time.perf_counter()
+    rgb, opacity = material.evaluate(
+        asked.uv,
+        asked.light,
+        asked.view,
+        0.5 if asked.footprint is None else asked.footprint,
+        0.0 if asked.curvature is None else asked.curvature,
+    )
+    ns = 1e9 * (time.perf_counter() - start) / max(len(asked), 1)
+    answered = replace(asked, rgb=rgb, opacity=opacity, channels=material.header.channels)
+    queryfile.write(answered, out, force=force)
+    return Outcome(
+        f"{out}: {len(asked)} queries, {ns:.0f} ns each",
+        {"out": out, "queries": len(asked), "ns_per_query": ns},
+    )
