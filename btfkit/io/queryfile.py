@@ -16,8 +16,8 @@ from btfkit.files import whole
 from btfkit.queries import QuerySet
 
 _ARRAYS = ("uv", "light", "view", "footprint", "curvature", "rgb", "opacity", "weight")
-# A million queries are 50 MB; a file that says it unpacks to more than this is hostile.
-_MOST_BYTES = 1 << 36
+# Queries hardly compress: a file that unpacks to gigabytes and 20 times its size is hostile.
+_MOST_BYTES, _MOST_RATIO = 1 << 30, 20
 
 
 def detect(path: Path) -> bool:
@@ -38,7 +38,7 @@ def read(path: Path) -> QuerySet:
     try:
         with zipfile.ZipFile(path) as archive:
             declared = sum(member.file_size for member in archive.infolist())
-        if declared > _MOST_BYTES:
+        if declared > max(_MOST_BYTES, _MOST_RATIO * path.stat().st_size):
             raise FormatError(path, f"says it unpacks to {declared} bytes")
         with np.load(path, allow_pickle=False) as file:
             found = {name: file[name] for name in file.files}
