@@ -13,6 +13,7 @@ from typing import Any, final
 
 from btfkit import io
 from btfkit.btf import BTF
+from btfkit.files import refuse_existing
 from btfkit.io import store_write
 
 # Files up to this size are hashed whole; of larger ones the two ends and the size.
@@ -80,7 +81,7 @@ def ingest(
         FormatError: damaged or unknown source.
         FileExistsError: `out` exists and `force` is False.
     """
-    final = Path(out) if out is not None else store_name(source)
+    final = refuse_existing(out if out is not None else store_name(source), force=force)
     name = format or io.detect(source)
     given = {key: value for key, value in (options or {}).items() if value is not None}
     settled = {"texel_mm": given.pop("texel_mm")} if _outside(name, given, "texel_mm") else {}
