@@ -8,7 +8,7 @@ KERNELS := $(wildcard btfkit/native/*.cpp btfkit/native/*.hpp)
 .PHONY: demo test test-quick check bench clean
 
 demo: $(STAMP)
-	$(BIN)/python demo.py
+	$(BIN)/python examples/demo.py
 
 test: check
 	$(BIN)/python -m pytest -n 2 --dist worksteal
