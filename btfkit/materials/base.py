@@ -45,6 +45,14 @@ class Header:
     steps: int = 0
     quantity: str = QUANTITY
 
+    def __post_init__(self) -> None:
+        if len(self.grid) != 2 or not all(isinstance(n, int) and n > 0 for n in self.grid):
+            raise ValueError(f"grid = {self.grid}; expected (h, w), both positive")
+        if not self.channels or not all(isinstance(name, str) for name in self.channels):
+            raise ValueError(f"channels = {self.channels}; expected one name a channel")
+        if self.wrap not in ("wrap", "clamp"):
+            raise ValueError(f"wrap = {self.wrap!r}; expected 'wrap' or 'clamp'")
+
     @property
     def aspect(self) -> float:
         """Tile width / tile height."""
