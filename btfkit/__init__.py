@@ -14,7 +14,7 @@ if TYPE_CHECKING:
         FitError,
         FormatError,
     )
-    from btfkit.fitting import fit
+    from btfkit.fitting.fit import fit
     from btfkit.io import open
     from btfkit.materials.base import Material
     from btfkit.materials.file import load
@@ -32,7 +32,7 @@ _HOMES = {
     "Query": "btfkit.queries",
     "QuerySet": "btfkit.queries",
     "Response": "btfkit.queries",
-    "fit": "btfkit.fitting",
+    "fit": "btfkit.fitting.fit",
     "load": "btfkit.materials.file",
     "open": "btfkit.io",
 }

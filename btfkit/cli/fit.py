@@ -66,7 +66,8 @@ def fit_verb(
     Writes the model and OUT.report.json beside it. Ctrl-C keeps the best state so far.
     """
     from btfkit.cli.sources import read_source
-    from btfkit.fitting import MODELS, fit
+    from btfkit.fitting import MODELS
+    from btfkit.fitting.fit import fit
 
     if model != "auto" and model not in MODELS:
         raise ValueError(f"no model {model!r}; there are auto, {', '.join(MODELS)}")

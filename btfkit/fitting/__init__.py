@@ -1,1 +1,20 @@
-"""Fitting: one trainable a model, and the one training loop. Needs torch."""
+"""Fitting: one trainable a model, and the one training loop. Needs torch once a fit runs."""
+
+from __future__ import annotations
+
+# Models that are trained by steps: classes that implement `loop.Trainable`.
+TRAINED: dict[str, str] = {
+    "neubtf": "btfkit.fitting.neubtf:NeuBTF",
+}
+# Models with a closed form: functions (source, *, settings, progress) -> Material.
+CLOSED_FORM: dict[str, str] = {}
+MODELS: dict[str, str] = {**CLOSED_FORM, **TRAINED}
+
+
+def cuda_device() -> str:
+    """Name of the CUDA device that a fit would take, or why there is none."""
+    import torch
+
+    if torch.cuda.is_available():
+        return str(torch.cuda.get_device_name(0))
+    return "none" if torch.version.cuda else "none (torch is a CPU build)"

@@ -1,0 +1,331 @@
+"""The one training loop: budget, best state, resumption, divergence, interruption."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from btfkit.errors import FitError, FormatError
+from btfkit.files import whole
+from btfkit.materials.base import Material
+
+# Held-out looks at the model: enough for a curve, and a small share of the time.
+_LOOKS = 12
+_SAVE_EVERY_S = 60.0
+_ROLLBACKS = 3
+# A loss this many times the recent median is a divergence, not a hard batch.
+_DIVERGED = 50.0
+
+
+class Trainable(ABC):
+    """A model while it is fitted. The loop owns time, the trainable everything else.
+
+    A trainable is deterministic: its state and the generators it was given decide all steps.
+
+    Attributes:
+        model: the name in `MODELS`.
+        queries: (light, view, texel) samples seen so far.
+        masked: texels of the data that are not measured.
+    """
+
+    model: ClassVar[str]
+    queries: int = 0
+    masked: int = 0
+
+    @abstractmethod
+    def step(self, progress: float) -> float:
+        """One optimiser step at `progress` in 0..1 of the budget; returns its loss."""
+
+    @abstractmethod
+    def material(self) -> Material:
+        """The model as it stands, ready to answer."""
+
+    @abstractmethod
+    def score(self) -> float:
+        """Error on a fixed, small part of the held-out set; lower is better; NaN without one."""
+
+    @abstractmethod
+    def state(self) -> dict[str, Tensor]:
+        """Everything that later steps depend on, copied: weights, moments, counters."""
+
+    @abstractmethod
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Take back what `state` gave."""
+
+    def training_arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays to save beside the material, for later fitting and propagation."""
+        return {}
+
+    def settled(self, progress: float) -> bool:
+        """Whether the model is whole at `progress`, so that its score counts for the best."""
+        del progress
+        return True
+
+    def slow_down(self) -> None:
+        """Halve the learning rates, after a divergence."""
+        raise FitError(f"{self.model} diverged and cannot slow down")
+
+
+@final
+@dataclass
+class Run:
+    """Where a run stands.
+
+    Attributes:
+        budget_s: wall time of the training alone, or None.
+        steps: steps to take, or None; exactly one of the two is set.
+        done: steps taken. elapsed_s, cpu_s: seconds of training so far.
+        curve: (elapsed seconds, step, score) at every look.
+        interrupted: whether the user ended it.
+    """
+
+    budget_s: float | None
+    steps: int | None
+    done: int = 0
+    elapsed_s: float = 0.0
+    cpu_s: float = 0.0
+    curve: list[tuple[float, int, float]] = field(default_factory=list)
+    best_score: float = math.inf
+    rollbacks: int = 0
+    interrupted: bool = False
+
+    def progress(self, since_s: float = 0.0) -> float:
+        """Share of the budget that is spent, 0..1."""
+        if self.steps is not None:
+            return min(self.done / self.steps, 1.0) if self.steps else 1.0
+        return min((self.elapsed_s + since_s) / (self.budget_s or 1.0), 1.0)
+
+
+def train(
+    trainable: Trainable,
+    run: Run,
+    *,
+    generators: Generators,
+    state_file: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    best: Mapping[str, Tensor] | None = None,
+) -> None:
+    """Train until the budget is spent; the trainable ends in its best state.
+
+    Args:
+        trainable: what is trained.
+        run: fresh, or read by `load_state` to go on; updated in place.
+        generators: all randomness of the run.
+        state_file: where a resumable state is kept while the run lasts.
+        progress: called with (per mille of the budget, 1000).
+        best: the best state so far, of a run that goes on.
+
+    Raises:
+        FitError: the loss diverges and rolling back does not help.
+    """
+    keeper = _Keeper(trainable, run, generators, state_file, best)
+    try:
+        while (share := run.progress()) < 1.0:
+            start, cpu = time.perf_counter(), time.process_time()
+            loss = trainable.step(share)
+            run.elapsed_s += time.perf_counter() - start
+            run.cpu_s += time.process_time() - cpu
+            run.done += 1
+            keeper.after_step(loss)
+            if progress:
+                progress(int(1000 * run.progress()), 1000)
+    except KeyboardInterrupt:
+        run.interrupted = True
+        keeper.save()
+    keeper.finish()
+
+
+@final
+@dataclass
+class Generators:
+    """All randomness of a run: one torch and one numpy generator from one seed."""
+
+    seed: int
+    torch: torch.Generator = field(init=False)
+    numpy: np.random.Generator = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.torch = torch.Generator().manual_seed(self.seed)
+        self.numpy = np.random.default_rng(self.seed)
+
+
+class _Keeper:
+    """Watches a run: looks at the held-out error, keeps the best, rolls back, saves."""
+
+    def __init__(
+        self,
+        trainable: Trainable,
+        run: Run,
+        generators: Generators,
+        state_file: Path | None,
+        best: Mapping[str, Tensor] | None,
+    ) -> None:
+        self._trainable, self._run, self._generators = trainable, run, generators
+        self._file = state_file
+        self._losses: deque[float] = deque(maxlen=64)
+        self._snapshot = trainable.state()
+        self._best = best
+        self._next_look = (math.floor(run.progress() * _LOOKS) + 1) / _LOOKS
+        self._saved_at = time.monotonic()
+
+    def after_step(self, loss: float) -> None:
+        recent = float(np.median(self._losses)) if len(self._losses) > 16 else math.inf
+        if not math.isfinite(loss) or loss > _DIVERGED * max(recent, 1e-6):
+            self._roll_back(loss)
+            return
+        self._losses.append(loss)
+        if self._run.progress() >= self._next_look:
+            self._next_look += 1 / _LOOKS
+            self._look()
+        if self._file and time.monotonic() - self._saved_at > _SAVE_EVERY_S:
+            self.save()
+
+    def save(self) -> None:
+        """Write the resumable state, if this run keeps one."""
+        self._saved_at = time.monotonic()
+        if self._file:
+            save_state(self._file, self._trainable, self._run, self._generators, self._best)
+
+    def finish(self) -> None:
+        """Leave the trainable in its best state."""
+        self._look()
+        if self._best is not None:
+            self._trainable.restore(self._best)
+
+    def _look(self) -> None:
+        score = self._trainable.score()
+        run = self._run
+        if not run.curve or run.curve[-1][1] != run.done:
+            run.curve.append((run.elapsed_s, run.done, score))
+        self._snapshot = self._trainable.state()
+        if self._trainable.settled(run.progress()) and score < run.best_score:
+            run.best_score = score
+            self._best = self._snapshot
+
+    def _roll_back(self, loss: float) -> None:
+        run = self._run
+        run.rollbacks += 1
+        if run.rollbacks > _ROLLBACKS:
+            raise FitError(
+                f"{self._trainable.model} diverges: loss {loss:.3g} at step {run.done}, after "
+                f"{_ROLLBACKS} rollbacks at half the rate each",
+                remedy="look for outliers in the data, or set a lower rate",
+            )
+        self._trainable.restore(self._snapshot)
+        self._trainable.slow_down()
+        self._losses.clear()
+
+
+def save_state(
+    path: Path,
+    trainable: Trainable,
+    run: Run,
+    generators: Generators,
+    best: Mapping[str, Tensor] | None,
+) -> None:
+    """Write what a later run needs to go on with the very same trajectory."""
+    record = {
+        "model": trainable.model,
+        "queries": trainable.queries,
+        "run": {name: getattr(run, name) for name in _RUN_FIELDS},
+        "numpy": generators.numpy.bit_generator.state,
+    }
+    tensors = {f"now.{name}": value for name, value in trainable.state().items()}
+    tensors |= {f"best.{name}": value for name, value in (best or {}).items()}
+    tensors["torch_generator"] = generators.torch.get_state()
+    with whole(path, force=True) as partial:
+        save_file(
+            {name: value.contiguous().clone() for name, value in tensors.items()},
+            partial,
+            {"btfkit_state": json.dumps(record)},
+        )
+
+
+_RUN_FIELDS = (
+    "budget_s", "steps", "done", "elapsed_s", "cpu_s", "curve", "best_score", "rollbacks",
+)  # fmt: skip
+
+
+def load_state(
+    path: Path, trainable: Trainable, run: Run, generators: Generators
+) -> dict[str, Tensor] | None:
+    """Take up a run where `save_state` left it; returns the best state so far.
+
+    Raises:
+        FormatError: the file is damaged or of another model.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            record = json.loads(file.metadata()["btfkit_state"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        raise FormatError(
+            path, f"not a readable state ({error})", remedy="start without --resume"
+        ) from error
+    if record["model"] != trainable.model:
+        raise FormatError(path, f"a state of {record['model']}, not of {trainable.model}")
+    wanted = (run.budget_s, run.steps)
+    for name, value in record["run"].items():
+        setattr(run, name, [tuple(p) for p in value] if name == "curve" else value)
+    run.budget_s, run.steps = wanted
+    trainable.queries = record["queries"]
+    generators.numpy.bit_generator.state = record["numpy"]
+    generators.torch.set_state(tensors.pop("torch_generator"))
+    now = {n.removeprefix("now."): t for n, t in tensors.items() if n.startswith("now.")}
+    best = {n.removeprefix("best."): t for n, t in tensors.items() if n.startswith("best.")}
+    trainable.restore(now)
+    return best or None
+
+
+def tensors_of(
+    modules: Mapping[str, torch.nn.Module], optimisers: Mapping[str, torch.optim.Optimizer]
+) -> dict[str, Tensor]:
+    """Copies of all weights and moments, by flat names: the heart of most `state`s."""
+    found: dict[str, Any] = {}
+    for name, module in modules.items():
+        for key, value in module.state_dict().items():
+            found[f"{name}.{key}"] = value
+    for name, optimiser in optimisers.items():
+        for index, slots in optimiser.state_dict()["state"].items():
+            for key, value in slots.items():
+                found[f"{name}.{index}.{key}"] = torch.as_tensor(value)
+        rates = [group["lr"] for group in optimiser.param_groups]
+        found[f"{name}.rates"] = torch.tensor(rates, dtype=torch.float64)
+    return {name: value.detach().clone() for name, value in found.items()}
+
+
+def restore_tensors(
+    state: Mapping[str, Tensor],
+    modules: Mapping[str, torch.nn.Module],
+    optimisers: Mapping[str, torch.optim.Optimizer],
+) -> None:
+    """Give back to modules and optimisers what `tensors_of` took from them."""
+    for name, module in modules.items():
+        prefix = f"{name}."
+        own = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+        module.load_state_dict(own)
+    for name, optimiser in optimisers.items():
+        packed = optimiser.state_dict()
+        slots: dict[int, dict[str, Tensor]] = {}
+        for key, value in state.items():
+            if key.startswith(f"{name}.") and key != f"{name}.rates":
+                index, slot = key.removeprefix(f"{name}.").split(".", 1)
+                slots.setdefault(int(index), {})[slot] = value.clone()
+        packed["state"] = slots
+        for group, rate in zip(packed["param_groups"], state[f"{name}.rates"], strict=True):
+            group["lr"] = float(rate)
+        optimiser.load_state_dict(packed)

@@ -1,0 +1,122 @@
+"""A bounded pool of textures that batches are drawn from, refilled in the background.
+
+Where all textures fit, they are decoded once. Where they do not, the pool is a window that
+moves along an endless sequence of shuffled epochs: what it holds at a step is a function of
+seed and step alone, so a resumed run sees the same data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit import native
+from btfkit.btf import BTF
+from btfkit.errors import FitError
+
+DEFAULT_BYTES = 1 << 30
+# Steps after which a part of a pool that does not hold everything is replaced.
+_REFRESH_STEPS = 64
+
+
+@final
+class Pool:
+    """Textures of some pairs of a BTF, in memory as float16 (float32 where values need it).
+
+    Args:
+        btf: where the textures come from.
+        pairs: (m,) the pairs that may be drawn.
+        seed: of the order in which they are taken.
+        most_bytes: memory for textures.
+        progress: called with (decoded, to decode) while the pool is first filled.
+
+    Attributes:
+        images: (k, h, w, c); NaN where not measured, as in the BTF.
+        pairs: (k,) the pair that each image is of.
+        masked: texels that are not measured, counted over what was decoded.
+
+    Raises:
+        FitError: no texel of any pair is measured.
+    """
+
+    def __init__(
+        self,
+        btf: BTF,
+        pairs: NDArray[np.intp],
+        *,
+        seed: int,
+        most_bytes: int = DEFAULT_BYTES,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        self._btf, self._all, self._seed = btf, pairs, seed
+        one = int(np.prod(btf.shape[1:])) * 2
+        count = int(np.clip(most_bytes // one, 1, len(pairs)))
+        self.whole = count == len(pairs)
+        self.pairs = pairs.copy() if self.whole else self._sequence(0, count)
+        self.masked = 0
+        self.images = self._filled(progress)
+        if not np.isfinite(self.images).any():
+            raise FitError("no texel of any texture is measured (all are NaN)")
+        self._moved = 0
+        self._worker = None if self.whole else ThreadPoolExecutor(1)
+        self._coming: Future[list[NDArray[np.float32]]] | None = None
+
+    def at_step(self, step: int) -> None:
+        """Bring the pool to what it holds at `step`; a resumed run may jump ahead."""
+        if self._worker is None:
+            return
+        due = step // _REFRESH_STEPS * self._quota
+        if due > self._moved + self._quota:
+            self._jump(due)
+        while self._moved < due:
+            first = len(self.pairs) + self._moved
+            coming = self._coming or self._worker.submit(self._decode, first)
+            slots = np.arange(first, first + self._quota) % len(self.pairs)
+            self.images[slots] = np.stack(coming.result())
+            self.pairs[slots] = self._sequence(first, self._quota)
+            self._moved += self._quota
+            self._coming = self._worker.submit(self._decode, first + self._quota)
+
+    @property
+    def _quota(self) -> int:
+        return max(1, len(self.pairs) // 16)
+
+    def _sequence(self, first: int, count: int) -> NDArray[np.intp]:
+        """Entries first..first+count of the endless sequence of shuffled epochs."""
+        m = len(self._all)
+        epochs = range(first // m, (first + count - 1) // m + 1)
+        orders = [np.random.default_rng([self._seed, e]).permutation(self._all) for e in epochs]
+        joined = np.concatenate(orders)
+        start = first - epochs[0] * m
+        return joined[start : start + count]
+
+    def _decode(self, first: int) -> list[NDArray[np.float32]]:
+        return [self._btf.texture(int(pair)) for pair in self._sequence(first, self._quota)]
+
+    def _jump(self, due: int) -> None:
+        self._moved = due
+        self._coming = None
+        newest = np.arange(due, due + len(self.pairs))
+        self.pairs[newest % len(self.pairs)] = self._sequence(due, len(self.pairs))
+        self.images = self._filled(None)
+
+    def _filled(
+        self, progress: Callable[[int, int], None] | None
+    ) -> NDArray[np.float16] | NDArray[np.float32]:
+        shape = (len(self.pairs), *self._btf.shape[1:])
+        images: NDArray[np.float16] | NDArray[np.float32] = np.empty(shape, np.float16)
+        with ThreadPoolExecutor(native.threads()) as workers:
+            decoded = workers.map(self._btf.texture, (int(pair) for pair in self.pairs))
+            for slot, image in enumerate(decoded):
+                finite = np.isfinite(image)
+                self.masked += int((~finite).any(axis=-1).sum())
+                if images.dtype == np.float16 and (np.abs(image) > 6e4).any(where=finite):
+                    images = images.astype(np.float32)
+                images[slot] = np.where(finite, image, np.nan)
+                if progress:
+                    progress(slot + 1, len(self.pairs))
+        return images

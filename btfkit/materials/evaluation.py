@@ -1,0 +1,121 @@
+"""Errors of a material on a BTF or on queries with answers, by the keys of docs/metrics.md."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from btfkit import metrics
+from btfkit.btf import BTF
+from btfkit.materials.base import Material
+from btfkit.queries import QuerySet
+
+
+def texel_centres(h: int, w: int) -> NDArray[np.float64]:
+    """(h, w, 2) uv of the centres of a grid of texels."""
+    u, v = np.meshgrid((np.arange(w) + 0.5) / w, (np.arange(h) + 0.5) / h)
+    return np.stack([u, v], axis=-1)
+
+
+def answer_pair(material: Material, btf: BTF, index: int) -> NDArray[np.float32]:
+    """(h, w, c) what a material answers for every texel of pair `index` of a BTF."""
+    _, h, w, _ = btf.shape
+    near = btf.light_position is not None or btf.view_position is not None
+    light = btf.light_at(index) if near else btf.light[index]
+    view = btf.view_at(index) if near else btf.view[index]
+    return material.evaluate(texel_centres(h, w), light, view).reflectance
+
+
+def errors_on_btf(
+    material: Material,
+    btf: BTF,
+    *,
+    pairs: ArrayLike | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Errors over whole textures.
+
+    Args:
+        material: what answers.
+        btf: what was measured.
+        pairs: indices of the pairs to compare; None takes all.
+        progress: called with (pairs done, pairs).
+
+    Returns:
+        mse, psnr, mse_log1p, psnr_log1p, mae, psnr_srgb (pooled over all texels), ssim_srgb and
+        flip (means over pairs), mean_psnr (mean over pairs of each pair's own), pairs, masked.
+
+    Raises:
+        ValueError: channels differ, or nothing is measured.
+    """
+    if material.header.channels != btf.channels:
+        raise ValueError(
+            f"the model answers channels {material.header.channels}; the BTF has {btf.channels}"
+        )
+    chosen = np.arange(len(btf)) if pairs is None else np.asarray(pairs, np.intp)
+    pooled, pictured = metrics.Pooled(), metrics.Pictured()
+    own: list[float] = []
+    for done, pair in enumerate(chosen):
+        truth, answer = btf.texture(int(pair)), answer_pair(material, btf, int(pair))
+        pooled.add(answer, truth)
+        pictured.add(answer, truth)
+        measured = np.isfinite(truth)
+        if measured.any():
+            own.append(metrics.psnr(float(np.square(answer - truth)[measured].mean())))
+        if progress:
+            progress(done + 1, len(chosen))
+    return {
+        **pooled.errors(),
+        **pictured.errors(),
+        "mean_psnr": float(np.mean(own)),
+        "pairs": len(chosen),
+        "masked": pooled.masked,
+    }
+
+
+def errors_on_queries(material: Material, queries: QuerySet) -> dict[str, Any]:
+    """Errors over rows that can be compared; the rest is masked and counted.
+
+    Returns:
+        mse, psnr, mse_log1p, psnr_log1p, mae, rows, masked; where footprints differ `levels`, the
+        errors by level of detail; where opacity is known `iou`.
+
+    Raises:
+        ValueError: the queries have no answers, or no row can be compared.
+    """
+    if queries.rgb is None:
+        raise ValueError("the query file has no answers (rgb) to compare with")
+    valid = queries.valid()
+    rows = queries.subset(valid)
+    if not len(rows) or rows.rgb is None:
+        raise ValueError(f"all {len(queries)} rows are masked (not finite, or seen from below)")
+    footprint = 0.5 if rows.footprint is None else rows.footprint
+    curvature = 0.0 if rows.curvature is None else rows.curvature
+    rgb, opacity = material.evaluate(rows.uv, rows.light, rows.view, footprint, curvature)
+    truth = rows.rgb if rows.opacity is None else np.where(rows.opacity[:, None] > 0, rows.rgb, 0)
+    found: dict[str, Any] = {
+        **_pooled(rgb, truth),
+        "rows": len(rows),
+        "masked": int((~valid).sum()),
+    }
+    if rows.footprint is not None and np.ptp(rows.footprint) > 0:
+        level = np.maximum(np.log2(2 * np.maximum(rows.footprint, 1e-30)), 0)
+        nearest = np.round(level).astype(int)
+        found["levels"] = [
+            {"level": int(n), **_pooled(rgb[nearest == n], truth[nearest == n])}
+            for n in np.unique(nearest)
+        ]
+    if rows.opacity is not None:
+        found["iou"] = metrics.iou(opacity, rows.opacity)
+    return found
+
+
+def _pooled(answer: NDArray[np.float32], truth: NDArray[np.float32]) -> dict[str, float]:
+    pooled = metrics.Pooled()
+    pooled.add(answer, truth)
+    errors = pooled.errors()
+    del errors["psnr_srgb"]
+    return errors
