@@ -19,6 +19,8 @@ from btfkit.errors import FormatError
 # The order is the order of detection: the more specific first.
 FORMATS: dict[str, str] = {
     "zarr": "btfkit.io.store",
+    "ubo2003": "btfkit.io.ubo2003",
+    "utia": "btfkit.io.utia",
 }
 
 

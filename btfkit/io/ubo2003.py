@@ -1,0 +1,116 @@
+"""UBO2003 and ATRIUM (University of Bonn): one JPEG or Radiance image a pair, in a folder or a zip.
+
+    MANYFILES/tv000_pv000/00081 tl015 pl000 tv000 pv000.jpg
+
+The running number is 81 * light + view; pairs are taken in its order. Images are rectified to the
+frontal view; phi = 0 is image +x and phi grows counter-clockwise, y up.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from btfkit import directions
+from btfkit.btf import BTF
+from btfkit.files import whole_folder
+from btfkit.io import archive, images, named
+
+SUFFIXES = {".jpg", ".jpeg", ".png", ".hdr"}
+
+
+def detect(path: Path) -> bool:
+    """Whether images named `... tl000 pl000 tv000 pv000.*` lie in a folder or zip; names only."""
+    return named.looks_named(archive.names_of(path), " ", SUFFIXES)
+
+
+def read(
+    path: Path,
+    *,
+    transfer: str | None = None,
+    cosine: str | None = None,
+    orientation: str | None = None,
+) -> BTF:
+    """A UBO2003 or ATRIUM BTF; textures are decoded when they are asked for.
+
+    Args:
+        path: folder or zip.
+        transfer: of JPEG code values; the database does not say, sRGB is assumed (brightness
+            against the angle of the light then falls as that of paper does).
+        cosine: "in" is assumed: brightness falls with the cosine.
+        orientation: of Radiance images: "standard" (assumed) or "btf_extractor".
+
+    Raises:
+        FormatError: damaged, a pair twice, or images of different sizes.
+    """
+    values, record = named.assumptions(
+        transfer=(transfer, "srgb"),
+        cosine=(cosine, "in"),
+        orientation=(orientation, "standard"),
+        scale=(None, "relative: 1 is the brightest code value"),
+    )
+    return named.read_named(
+        path,
+        named.decode_image(values["transfer"], values["orientation"]),
+        suffixes=SUFFIXES,
+        cosine=values["cosine"],
+        provenance={"format": "ubo2003", **record},
+    )
+
+
+def write(
+    btf: BTF,
+    path: str | os.PathLike[str],
+    *,
+    quality: int = 100,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write a folder of JPEGs named as UBO2003 does; values are clamped to 0..1 and sRGB encoded.
+
+    Args:
+        btf: whose directions must be whole degrees, as the names hold no more.
+        path: folder to write; one folder a view inside.
+        quality: of the JPEG, 1 to 100.
+        force: whether an existing folder is replaced.
+        progress: called with (images written, n).
+
+    Raises:
+        ValueError: two pairs that would have the same name.
+    """
+    names = _names(btf)
+    with whole_folder(path, force=force) as folder:
+        for pair, name in enumerate(names):
+            file = folder / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(images.encode_jpeg(btf.texture(pair), quality=quality))
+            if progress:
+                progress(pair + 1, len(btf))
+
+
+def _names(btf: BTF) -> list[str]:
+    """Relative names: 81 (or as many as there are) * light + view, and the four angles."""
+    lights, light_index = directions.unique(btf.light)
+    views, view_index = directions.unique(btf.view)
+    light_degrees, view_degrees = (_whole_degrees(table) for table in (lights, views))
+    names = []
+    for i, j in zip(light_index, view_index, strict=True):
+        (tl, pl), (tv, pv) = light_degrees[i], view_degrees[j]
+        number = len(views) * i + j
+        base = f"{number:05d} tl{tl:03d} pl{pl:03d} tv{tv:03d} pv{pv:03d}.jpg"
+        names.append(f"tv{tv:03d}_pv{pv:03d}/{base}")
+    if len({name.split(" ", 1)[1] for name in names}) < len(names):
+        raise ValueError(
+            "directions are closer than one degree: UBO2003 names cannot tell them apart; "
+            "write utia or manifest instead"
+        )
+    return names
+
+
+def _whole_degrees(table: np.ndarray) -> list[tuple[int, int]]:
+    theta, phi = directions.to_angles(table)
+    degrees = np.rint(np.degrees([theta, phi])).astype(int)
+    return [(int(t), int(p) % 360) for t, p in degrees.T]

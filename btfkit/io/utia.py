@@ -1,0 +1,156 @@
+"""UTIA BTFs: one PNG (sRGB) or EXR (half, CIE XYZ under D65) a pair, in a folder or a zip.
+
+    tv000_pv000/tl000_pl000_tv000_pv000.png
+
+Where light and view coincide the lamp was physically shifted; the name keeps the nominal angles.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from btfkit import colour, directions
+from btfkit.btf import BTF
+from btfkit.errors import FormatError
+from btfkit.files import whole_folder
+from btfkit.io import archive, images, named
+from btfkit.textures import Array
+
+SUFFIXES = {".png", ".exr", ".jpg", ".jpeg"}
+
+
+def detect(path: Path) -> bool:
+    """Whether images named `tl000_pl000_tv000_pv000.*` lie in a folder or zip; names only."""
+    return named.looks_named(archive.names_of(path), "_", SUFFIXES)
+
+
+def read(
+    path: Path,
+    *,
+    transfer: str | None = None,
+    cosine: str | None = None,
+    exr_colour: str | None = None,
+    light_shift: Path | None = None,
+) -> BTF:
+    """A UTIA BTF; textures are decoded when they are asked for.
+
+    Args:
+        path: folder or zip.
+        transfer: of PNG code values, sRGB by the publisher.
+        cosine: "in" is assumed.
+        exr_colour: of EXR values: "xyz" (by the publisher) or "rgb".
+        light_shift: a text table with columns number, theta, phi, theta_S, phi_S (degrees): where
+            the lamp really stood when light and view coincide.
+
+    Raises:
+        FormatError: damaged, a pair twice, images of different sizes, or no such table.
+    """
+    values, record = named.assumptions(
+        transfer=(transfer, "srgb"), cosine=(cosine, "in"), exr_colour=(exr_colour, "xyz")
+    )
+    if values["exr_colour"] not in ("xyz", "rgb"):
+        raise ValueError(f"exr_colour {values['exr_colour']!r}; expected xyz or rgb")
+
+    def decode(name: str, data: bytes) -> Array:
+        if not name.lower().endswith(".exr"):
+            return images.read(name, data, transfer=values["transfer"])
+        pixels, channels, _ = images.read_exr(name, data)
+        if len(channels) < 3:
+            raise FormatError(name, f"channels {channels}; expected three")
+        rgb = pixels[..., :3]
+        return colour.xyz_to_rgb(rgb) if values["exr_colour"] == "xyz" else rgb
+
+    btf = named.read_named(
+        path,
+        decode,
+        suffixes=SUFFIXES,
+        cosine=values["cosine"],
+        provenance={"format": "utia", **record},
+    )
+    return btf if light_shift is None else _shifted(btf, Path(light_shift))
+
+
+def _shifted(btf: BTF, table: Path) -> BTF:
+    """The BTF with the true lights of pairs whose nominal light and view coincide."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            rows = np.loadtxt(table, ndmin=2, comments=("#", "%"))
+    except (OSError, ValueError) as error:
+        raise FormatError(table, f"not a readable table of light shifts ({error})") from error
+    if rows.shape[1] != 5:
+        raise FormatError(
+            table, f"{rows.shape[1]} columns; expected number, theta, phi, theta_S, phi_S"
+        )
+    angles = np.radians(rows[:, 1:])
+    nominal = directions.from_angles(angles[:, 0], angles[:, 1])
+    real = directions.from_angles(angles[:, 2], angles[:, 3])
+    light = btf.light.copy()
+    coincide = np.flatnonzero(np.sum(btf.light * btf.view, axis=1) > 1 - 1e-6)
+    moved = 0
+    for pair in coincide:
+        match = np.flatnonzero(nominal @ btf.light[pair] > 1 - 1e-6)
+        if match.size:
+            light[pair] = real[match[0]]
+            moved += 1
+    provenance = {**btf.provenance, "light_shift": str(table), "light_shifted_pairs": moved}
+    return replace(btf, light=light, provenance=provenance)
+
+
+def write(
+    btf: BTF,
+    path: str | os.PathLike[str],
+    *,
+    exr: bool = False,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write a folder of images named as UTIA does; angles with as many decimals as they need.
+
+    Args:
+        btf: of three channels.
+        path: folder to write; one folder a view inside.
+        exr: half EXR in CIE XYZ, unclamped; else 8-bit sRGB PNG.
+        force: whether an existing folder is replaced.
+        progress: called with (images written, n).
+
+    Raises:
+        ValueError: not three channels.
+    """
+    if btf.shape[3] != 3:
+        raise ValueError(f"UTIA files hold three channels; the BTF has {btf.shape[3]}")
+    with whole_folder(path, force=force) as folder:
+        for pair in range(len(btf)):
+            tl, pl = _degrees(btf.light[pair])
+            tv, pv = _degrees(btf.view[pair])
+            name = f"tv{tv}_pv{pv}/tl{tl}_pl{pl}_tv{tv}_pv{pv}.{'exr' if exr else 'png'}"
+            file = folder / name
+            file.parent.mkdir(exist_ok=True)
+            texture = btf.texture(pair)
+            if exr:
+                xyz = colour.rgb_to_xyz(texture).astype(np.float16)
+                images.write_exr(file, xyz, ("R", "G", "B"))
+            else:
+                file.write_bytes(images.encode_png(texture))
+            if progress:
+                progress(pair + 1, len(btf))
+
+
+def _degrees(direction: Array) -> tuple[str, str]:
+    """Angles as text: 045, or 007.5 where a whole degree would move the direction."""
+    theta, phi = (float(np.degrees(angle)) for angle in directions.to_angles(direction))
+    return _angle(theta), _angle(phi % 360)
+
+
+def _angle(degrees: float) -> str:
+    rounded = round(degrees, 3)
+    whole = round(rounded)
+    if abs(rounded - whole) < 0.01:
+        return f"{whole % 360:03d}"
+    return f"{rounded:07.3f}".rstrip("0")
