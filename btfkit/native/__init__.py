@@ -11,7 +11,7 @@ import importlib
 import os
 from types import ModuleType
 
-KERNELS: tuple[str, ...] = ()
+KERNELS: tuple[str, ...] = ("neumip",)
 
 
 def load(name: str) -> ModuleType | None:

@@ -1,0 +1,149 @@
+"""NeuMIP in plain torch: the gradient's oracle, and the form that runs where no kernel does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from btfkit.native.neumip import DIRECTIONS, LEAK, Layout, Network, Pyramid
+
+
+def forward(
+    layout: Layout,
+    weights: Tensor,
+    texels: Tensor,
+    uv: Tensor,
+    light: Tensor,
+    view: Tensor,
+    footprint: Tensor | None = None,
+) -> Tensor:
+    """The decoder's raw numbers (b, outputs) for flat queries; differentiable.
+
+    Args:
+        layout: the model. weights: (layout.weights,). texels: (layout.texels, 8).
+        uv: (b, 2). light, view: (b, 3) unit vectors.
+        footprint: (b,) texels of the data's grid; None is 0.5 throughout.
+    """
+    known = directions(light, view, footprint)
+    offset_weights, decoder_weights = layout.split(weights)
+    textures = layout.textures(texels)
+    depth = torch.zeros((), dtype=uv.dtype, device=uv.device)
+    if layout.offset is not None:
+        pyramid, network = layout.offset
+        psi = bilinear(textures.pop(0)[0], uv, wrap=layout.wrap)[:, : pyramid.channels]
+        depth = run(network, offset_weights, [psi], known) * layout.depth_scale
+    features = []
+    for bank, levels in zip(layout.banks, textures, strict=True):
+        move = bank.view * step(view, layout) - bank.light * step(light, layout)
+        features.append(_between_levels(bank, levels, uv + depth * move, known, wrap=layout.wrap))
+    return run(layout.decoder, decoder_weights, features, known)
+
+
+def log_answer(layout: Layout, raw: Tensor) -> Tensor:
+    """log(1 + rgb) (b, c) from the decoder's raw numbers."""
+    if layout.output == "relu":
+        return torch.relu(raw)
+    if layout.output == "mask":
+        c = layout.channels
+        return raw[:, :c] * (0.1 + torch.sigmoid(raw[:, c:]))
+    return raw
+
+
+def loss_of(
+    layout: Layout, answer: Tensor, target: Tensor, weight: Tensor | None, kind: str
+) -> Tensor:
+    """Mean loss of log answers (b, c) against log(1 + max(target, -0.1)).
+
+    Values that are not finite count nothing.
+    """
+    good = torch.isfinite(target)
+    # No 0 * NaN: what is not measured is replaced before anything is computed from it.
+    error = answer - torch.log1p(torch.where(good, target, 0.0).clamp(min=-0.1))
+    each = error**2 if kind == "square" else error.abs()
+    each = torch.where(good, each, 0.0)
+    return (each if weight is None else each * weight[:, None]).mean()
+
+
+def step(direction: Tensor, layout: Layout) -> Tensor:
+    """Displacement (b, 2) in uv of one tile width of depth: H of the paper, v down the rows."""
+    xy = direction[:, :2] / direction[:, 2:].clamp(min=0.6)
+    return xy * xy.new_tensor([1.0, -layout.aspect])
+
+
+def directions(light: Tensor, view: Tensor, footprint: Tensor | None) -> dict[str, Tensor]:
+    """Every number of `DIRECTIONS`, (b,) each."""
+    total = light + view
+    length = torch.linalg.vector_norm(total, dim=1, keepdim=True)
+    none = length < 1e-6
+    up = total.new_tensor([[0.0, 0.0, 1.0]])
+    half = torch.where(none, up, total / torch.where(none, 1.0, length))
+    cos_diff = torch.where(none, 0.0, length / 2)[:, 0]
+    level = torch.zeros_like(cos_diff)
+    if footprint is not None:
+        level = torch.log2((2 * footprint).clamp(min=1))
+    columns = [*light.T, *view.T, *half.T, cos_diff, level / 8]
+    return dict(zip(DIRECTIONS, columns, strict=True))
+
+
+def run(
+    network: Network, flat: Tensor, features: Sequence[Tensor], known: dict[str, Tensor]
+) -> Tensor:
+    """Outputs (b, o) of a network for its features and the directions it takes."""
+    x = torch.cat([*features, *(known[name][:, None] for name in network.directions)], dim=1)
+    at, last = 0, len(network.widths) - 2
+    for layer, (a, b) in enumerate(zip(network.widths, network.widths[1:], strict=False)):
+        matrix = flat[at : at + a * b].reshape(b, a)
+        at += (a + 1) * b
+        x = torch.addmm(flat[at - b : at], x, matrix.T)
+        if layer < last:
+            x = _activate(network.activation, x)
+    return x
+
+
+def _activate(kind: str, x: Tensor) -> Tensor:
+    if kind == "relu":
+        return torch.relu(x)
+    if kind == "leaky":
+        return torch.nn.functional.leaky_relu(x, LEAK)
+    return torch.sin(x) if kind == "sine" else x
+
+
+def _between_levels(
+    bank: Pyramid, levels: list[Tensor], uv: Tensor, known: dict[str, Tensor], *, wrap: bool
+) -> Tensor:
+    if len(levels) == 1:
+        return bilinear(levels[0], uv, wrap=wrap)[:, : bank.channels]
+    level = (known["level"] * 8 - bank.shift).clamp(0, len(levels) - 1)
+    found = torch.zeros(len(uv), bank.channels, dtype=uv.dtype, device=uv.device)
+    for s, texture in enumerate(levels):
+        # The paper's eq. 3 has both weights 0 at whole levels; these sum to 1.
+        weight = (1 - (level - s).abs()).clamp(min=0)
+        rows = torch.nonzero(weight)[:, 0]
+        if len(rows):
+            value = bilinear(texture, uv[rows], wrap=wrap)[:, : bank.channels]
+            found = found.index_add(0, rows, weight[rows, None] * value)
+    return found
+
+
+def bilinear(texture: Tensor, uv: Tensor, *, wrap: bool) -> Tensor:
+    """(b, k) of a texture (h, w, k) at uv (b, 2), tiling or clamped at its borders."""
+    h, w, k = texture.shape
+    size = uv.new_tensor([w, h])
+    if wrap:
+        uv = uv - uv.floor().detach()
+    at = uv * size - 0.5
+    at = torch.maximum(torch.minimum(at, size), -torch.ones_like(size))
+    low = at.floor().detach()
+    fx, fy = (at - low).T[..., None]
+    x0, y0 = low.long().T
+    if wrap:
+        x0, x1, y0, y1 = x0 % w, (x0 + 1) % w, y0 % h, (y0 + 1) % h
+    else:
+        x1, y1 = (x0 + 1).clamp(0, w - 1), (y0 + 1).clamp(0, h - 1)
+        x0, y0 = x0.clamp(0, w - 1), y0.clamp(0, h - 1)
+    flat = texture.reshape(-1, k)
+    upper = flat[y0 * w + x0] * (1 - fx) + flat[y0 * w + x1] * fx
+    lower = flat[y1 * w + x0] * (1 - fx) + flat[y1 * w + x1] * fx
+    return upper * (1 - fy) + lower * fy

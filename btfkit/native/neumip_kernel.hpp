@@ -1,0 +1,429 @@
+// The kernels for one vector width: included once a variant, with NEUMIP_SPACE (its namespace),
+// NEUMIP_LANES (floats a vector) and NEUMIP_TARGET (what the compiler may use) defined.
+//
+// A tile of queries is kept as rows of one number each (channel-major), so that a layer is a
+// small matrix product with the queries along the vector lanes and the weights broadcast.
+// clang-format off
+#define FN NEUMIP_TARGET static inline __attribute__((always_inline))
+#define MEMBER NEUMIP_TARGET inline __attribute__((always_inline))
+#define DEEP NEUMIP_TARGET static __attribute__((noinline))
+// clang-format on
+
+namespace neumip {
+namespace NEUMIP_SPACE {
+
+constexpr int L = NEUMIP_LANES;
+typedef float F __attribute__((vector_size(4 * NEUMIP_LANES), may_alias));
+typedef int32_t I __attribute__((vector_size(4 * NEUMIP_LANES), may_alias));
+typedef float V8 __attribute__((vector_size(32), may_alias, aligned(4)));
+
+constexpr int kTile = 256;
+constexpr int kStride = kTile + 16;  // a power of two would put every row on the same cache sets
+constexpr int kAhead = 16;
+
+FN F load(const float* p) { return *(const F*)p; }
+FN void store(float* p, F v) { *(F*)p = v; }
+FN F all(float x) { return x - F{}; }  // x + 0 would not fold: it turns -0 into 0
+FN F select(I mask, F a, F b) { return (F)((mask & (I)a) | (~mask & (I)b)); }
+// larger and smaller give b where a is not a number.
+#if NEUMIP_LANES == 16
+FN F larger(F a, F b) { return (F)_mm512_max_ps((__m512)a, (__m512)b); }
+FN F smaller(F a, F b) { return (F)_mm512_min_ps((__m512)a, (__m512)b); }
+FN F root(F x) { return (F)_mm512_sqrt_ps((__m512)x); }
+FN F nearest(F x) { return (F)_mm512_roundscale_ps((__m512)x, 0); }
+FN F floor_of(F x) { return (F)_mm512_roundscale_ps((__m512)x, 1); }
+#elif NEUMIP_LANES == 8
+FN F larger(F a, F b) { return (F)_mm256_max_ps((__m256)a, (__m256)b); }
+FN F smaller(F a, F b) { return (F)_mm256_min_ps((__m256)a, (__m256)b); }
+FN F root(F x) { return (F)_mm256_sqrt_ps((__m256)x); }
+FN F nearest(F x) { return (F)_mm256_round_ps((__m256)x, 8); }
+FN F floor_of(F x) { return (F)_mm256_round_ps((__m256)x, 9); }
+#else
+FN F larger(F a, F b) { return a > b ? a : b; }
+FN F smaller(F a, F b) { return a < b ? a : b; }
+FN F root(F x) {
+    for (int i = 0; i < L; ++i) x[i] = __builtin_sqrtf(x[i]);
+    return x;
+}
+FN F nearest(F x) {  // |x| < 2^22; beyond, x itself, which has next to no fraction left
+    const F magic = all(12582912.f), size = x < all(0.f) ? -x : x;
+    return size < all(4194304.f) ? (x + magic) - magic : x;
+}
+FN F floor_of(F x) {
+    const F r = nearest(x);
+    return r - (r > x ? all(1.f) : all(0.f));
+}
+#endif
+
+// exp for -87 <= x <= 88. Source: Cephes expf.
+FN F exp_of(F x) {
+    x = smaller(larger(x, all(-87.f)), all(88.f));
+    const F n = nearest(x * 1.44269504088896341f);
+    x = x - n * 0.693359375f;
+    x = x + n * 2.12194440e-4f;
+    F y = all(1.9875691500e-4f);
+    y = y * x + 1.3981999507e-3f;
+    y = y * x + 8.3334519073e-3f;
+    y = y * x + 4.1665795894e-2f;
+    y = y * x + 1.6666665459e-1f;
+    y = y * x + 5.0000001201e-1f;
+    y = y * x * x + x + 1.f;
+    const I scale = (__builtin_convertvector(n, I) + 127) << 23;
+    return y * (F)scale;
+}
+
+// Natural logarithm of normal x > 0. Source: Cephes logf.
+FN F log_of(F x) {
+    const I bits = (I)x;
+    I e = ((bits >> 23) & 255) - 126;
+    F m = (F)((bits & 0x007fffff) | 0x3f000000);
+    const I low = m < all(0.707106781f);
+    e = e + low;  // a true mask is -1
+    m = m + select(low, m, all(0.f)) - 1.f;
+    const F z = m * m;
+    F y = all(7.0376836292e-2f);
+    y = y * m - 1.1514610310e-1f;
+    y = y * m + 1.1676998740e-1f;
+    y = y * m - 1.2420140846e-1f;
+    y = y * m + 1.4249322787e-1f;
+    y = y * m - 1.6668057665e-1f;
+    y = y * m + 2.0000714765e-1f;
+    y = y * m - 2.4999993993e-1f;
+    y = y * m + 3.3333331174e-1f;
+    const F n = __builtin_convertvector(e, F);
+    y = y * m * z - n * 2.12194440e-4f - z * 0.5f;
+    return m + y + n * 0.693359375f;
+}
+
+// sin and cos of 2 pi u for |u| <= 1/2, to 1e-7 and 1e-8: least squares on Chebyshev nodes.
+FN F sine_of_turn(F u) {
+    const F q = u * u;
+    F p = all(12.23593025532227f);
+    p = p * q - 38.12418001627253f;
+    p = p * q + 67.04401210989847f;
+    p = p * q - 64.83468551736061f;
+    p = p * q + 25.132730419927455f;
+    return p * (u * (0.25f - q));
+}
+FN F cosine_of_turn(F u) {
+    const F q = u * u;
+    F p = all(-6.541494115107186f);
+    p = p * q + 25.568783955332695f;
+    p = p * q - 58.572515169836485f;
+    p = p * q + 81.78974748812098f;
+    p = p * q - 59.82728047212572f;
+    p = p * q + 15.999999837185692f;
+    return p * (0.0625f - q);
+}
+
+FN V8 get8(const float* p) { return *(const V8*)p; }
+FN void put8(float* p, V8 v) { *(V8*)p = v; }
+
+// Eight rows of eight, transposed.
+FN void transpose8(V8 r[8]) {
+    V8 t[8], s[8];
+#pragma GCC unroll 8
+    for (int i = 0; i < 8; i += 2) {
+        t[i] = __builtin_shufflevector(r[i], r[i + 1], 0, 8, 1, 9, 4, 12, 5, 13);
+        t[i + 1] = __builtin_shufflevector(r[i], r[i + 1], 2, 10, 3, 11, 6, 14, 7, 15);
+    }
+#pragma GCC unroll 8
+    for (int i = 0; i < 8; i += 4) {
+        s[i] = __builtin_shufflevector(t[i], t[i + 2], 0, 1, 8, 9, 4, 5, 12, 13);
+        s[i + 1] = __builtin_shufflevector(t[i], t[i + 2], 2, 3, 10, 11, 6, 7, 14, 15);
+        s[i + 2] = __builtin_shufflevector(t[i + 1], t[i + 3], 0, 1, 8, 9, 4, 5, 12, 13);
+        s[i + 3] = __builtin_shufflevector(t[i + 1], t[i + 3], 2, 3, 10, 11, 6, 7, 14, 15);
+    }
+#pragma GCC unroll 8
+    for (int i = 0; i < 4; ++i) {
+        r[i] = __builtin_shufflevector(s[i], s[i + 4], 0, 1, 2, 3, 8, 9, 10, 11);
+        r[i + 4] = __builtin_shufflevector(s[i], s[i + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+    }
+}
+
+FN float sum_of(F v) {
+#if NEUMIP_LANES == 16
+    typedef float H8 __attribute__((vector_size(32)));
+    H8 a = __builtin_shufflevector(v, v, 0, 1, 2, 3, 4, 5, 6, 7) +
+           __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15);
+#else
+    const F a = v;
+#endif
+    typedef float H4 __attribute__((vector_size(16)));
+#if NEUMIP_LANES >= 8
+    H4 b = __builtin_shufflevector(a, a, 0, 1, 2, 3) + __builtin_shufflevector(a, a, 4, 5, 6, 7);
+#else
+    H4 b = a;
+#endif
+    b = b + __builtin_shufflevector(b, b, 2, 3, 2, 3);
+    return b[0] + b[1];
+}
+
+// ---------------------------------------------------------------- layers
+
+enum Mode {
+    kPlain, kForwardRelu, kForwardLeaky, kForwardSine, kTrainSine,
+    kBackRelu, kBackLeaky, kBackSine
+};
+
+// A matrix for `gemm`: groups of a few outputs, each group k-major; what is left over at the end.
+struct Packed {
+    int in = 0, out = 0;
+    std::vector<float> weights, bias;
+
+    void reset(int inputs, int outputs) {
+        in = inputs;
+        out = outputs;
+        weights.resize(size_t(in) * out);
+        bias.assign(out, 0.f);
+    }
+    // Five rows and two vectors fill the registers best; four waste nothing on 24 and 32.
+    static int group(int out) { return out < 5 ? out : out % 5 != 0 && out % 4 == 0 ? 4 : 5; }
+    template <class At>
+    void fill(At at) {
+        float* p = weights.data();
+        const int m = group(out);
+        for (int o = 0; o < out; o += m)
+            for (int k = 0; k < in; ++k)
+                for (int i = o; i < std::min(o + m, out); ++i) *p++ = at(i, k);
+    }
+};
+
+template <int MR, int NR>
+FN void multiply(F (&acc)[MR][NR], const float* w, const float* x) {
+    F xs[NR];
+#pragma GCC unroll 8
+    for (int n = 0; n < NR; ++n) xs[n] = load(x + n * L);
+#pragma GCC unroll 8
+    for (int m = 0; m < MR; ++m) {
+        const F s = all(w[m]);
+#pragma GCC unroll 8
+        for (int n = 0; n < NR; ++n) acc[m][n] += s * xs[n];
+    }
+}
+
+template <int MR, int NR, int MODE>
+FN void block(const float* w, const float* bias, const float* x, int in, float* y, float* side) {
+    F acc[MR][NR];
+#pragma GCC unroll 8
+    for (int m = 0; m < MR; ++m)
+#pragma GCC unroll 8
+        for (int n = 0; n < NR; ++n) acc[m][n] = all(bias[m]);
+    int k = in;
+    // By fours: the end of a run of 25 would be mispredicted, of six it is not.
+    for (; k >= 4; k -= 4, x += 4 * kStride, w += 4 * MR) {
+        multiply<MR, NR>(acc, w, x);
+        multiply<MR, NR>(acc, w + MR, x + kStride);
+        multiply<MR, NR>(acc, w + 2 * MR, x + 2 * kStride);
+        multiply<MR, NR>(acc, w + 3 * MR, x + 3 * kStride);
+    }
+    for (; k > 0; --k, x += kStride, w += MR) multiply<MR, NR>(acc, w, x);
+#pragma GCC unroll 8
+    for (int m = 0; m < MR; ++m)
+#pragma GCC unroll 8
+        for (int n = 0; n < NR; ++n) {
+            F v = acc[m][n];
+            const int at = m * kStride + n * L;
+            if constexpr (MODE == kForwardRelu) v = larger(v, all(0.f));
+            if constexpr (MODE == kForwardLeaky) v = v > all(0.f) ? v : v * kLeak;
+            if constexpr (MODE == kForwardSine || MODE == kTrainSine) {
+                const F u = v - nearest(v);
+                if constexpr (MODE == kTrainSine) store(side + at, cosine_of_turn(u));
+                v = sine_of_turn(u);
+            }
+            if constexpr (MODE == kBackRelu) v = load(side + at) > all(0.f) ? v : all(0.f);
+            if constexpr (MODE == kBackLeaky) v = load(side + at) > all(0.f) ? v : v * kLeak;
+            if constexpr (MODE == kBackSine) v = v * load(side + at);
+            store(y + at, v);
+        }
+}
+
+// Queries outermost: a column of inputs stays in the nearest cache for all groups of outputs.
+template <int MR, int NR, int MODE>
+FN void strip(const Packed& p, int first, int groups, const float* x, float* y, float* side, int n) {
+    const int in = p.in;
+    for (int at = 0; at < n; at += NR * L)
+        for (int g = 0; g < groups; ++g) {
+            const int o = first + g * MR, to = o * kStride + at;
+            block<MR, NR, MODE>(p.weights.data() + o * in, p.bias.data() + o, x + at, in, y + to,
+                                side + to);
+        }
+}
+
+template <int MODE>
+FN void strips(const Packed& p, int m, int first, int groups, const float* x, float* y, float* side,
+               int n) {
+    constexpr int wide = L == 16 ? 4 : 2;
+    switch (m) {
+        case 5: strip<5, wide, MODE>(p, first, groups, x, y, side, n); break;
+        case 4: strip<4, wide, MODE>(p, first, groups, x, y, side, n); break;
+        case 3: strip<3, 4, MODE>(p, first, groups, x, y, side, n); break;
+        case 2: strip<2, 4, MODE>(p, first, groups, x, y, side, n); break;
+        default: strip<1, 8, MODE>(p, first, groups, x, y, side, n); break;
+    }
+}
+
+// y = mode(matrix x + bias) for n queries; n is a multiple of 8 vectors.
+template <int MODE>
+DEEP void gemm(const Packed& p, const float* x, float* y, float* side, int n) {
+    const int m = Packed::group(p.out), groups = p.out / m, rest = p.out % m;
+    if (side == nullptr) side = y;
+    strips<MODE>(p, m, 0, groups, x, y, side, n);
+    if (rest) strips<MODE>(p, rest, groups * m, 1, x, y, side, n);
+}
+
+template <int MO, int MI>
+FN void outer_block(const float* dy, const float* x, int n, float* dw, int row) {
+    F acc[MO][MI] = {};
+#pragma GCC unroll 4
+    for (int at = 0; at < n; at += L) {
+        F xs[MI];
+#pragma GCC unroll 8
+        for (int i = 0; i < MI; ++i) xs[i] = load(x + i * kStride + at);
+#pragma GCC unroll 8
+        for (int o = 0; o < MO; ++o) {
+            const F d = load(dy + o * kStride + at);
+#pragma GCC unroll 8
+            for (int i = 0; i < MI; ++i) acc[o][i] += d * xs[i];
+        }
+    }
+#pragma GCC unroll 8
+    for (int o = 0; o < MO; ++o)
+#pragma GCC unroll 8
+        for (int i = 0; i < MI; ++i) dw[o * row + i] += sum_of(acc[o][i]);
+}
+
+template <int MO>
+FN void outer_rows(const float* dy, const float* x, int in, int n, float* dw, int row) {
+    constexpr int MI = MO >= 5 ? (L == 16 ? 4 : 2) : MO >= 3 ? 3 : 4;
+    int i = 0;
+    for (; i + MI <= in; i += MI) outer_block<MO, MI>(dy, x + i * kStride, n, dw + i, row);
+    for (; i < in; ++i) outer_block<MO, 1>(dy, x + i * kStride, n, dw + i, row);
+}
+
+// dw (out, in) += dy x^T over n queries.
+DEEP void outer(const float* dy, const float* x, int out, int in, int n, float* dw) {
+    for (int o = 0; o < out;) {
+        const int groups = (out - o + 4) / 5, m = (out - o + groups - 1) / groups;
+        const float* d = dy + o * kStride;
+        float* to = dw + o * in;
+        switch (m) {
+            case 5: outer_rows<5>(d, x, in, n, to, in); break;
+            case 4: outer_rows<4>(d, x, in, n, to, in); break;
+            case 3: outer_rows<3>(d, x, in, n, to, in); break;
+            case 2: outer_rows<2>(d, x, in, n, to, in); break;
+            default: outer_rows<1>(d, x, in, n, to, in); break;
+        }
+        o += m;
+    }
+}
+
+// ---------------------------------------------------------------- networks
+
+struct Net {
+    const Mlp* mlp = nullptr;
+    std::vector<Packed> forward, backward;
+    std::vector<float> gradient;  // a layer: (out, in + 1), the bias last
+
+    void pack(const Mlp& m, const float* flat, bool train) {
+        mlp = &m;
+        const int layers = m.layers();
+        forward.resize(layers);
+        backward.resize(train ? layers : 0);
+        if (train) gradient.assign(m.size(), 0.f);
+        const float* w = flat + m.start;
+        for (int l = 0; l < layers; ++l) {
+            const int in = m.widths[l], out = m.widths[l + 1];
+            // Sines count their phase in turns; the weights are in radians.
+            const bool turns = m.activation == kSine && l + 1 < layers;
+            const float scale = turns ? 0.15915494309189535f : 1.f;
+            forward[l].reset(in, out);
+            forward[l].fill([&](int o, int k) { return w[o * in + k] * scale; });
+            for (int o = 0; o < out; ++o) forward[l].bias[o] = w[size_t(in) * out + o] * scale;
+            if (train) {
+                const int rows = l == 0 ? m.features() : in;
+                backward[l].reset(out, rows);
+                backward[l].fill([&](int o, int k) { return w[k * in + o]; });
+            }
+            w += size_t(in + 1) * out;
+        }
+    }
+    // Gradients in the order of the flat weights, added to `flat`.
+    void unpack(float* flat) const {
+        float* w = flat + mlp->start;
+        const float* g = gradient.data();
+        for (int l = 0; l < mlp->layers(); ++l) {
+            const int in = mlp->widths[l], out = mlp->widths[l + 1];
+            for (int o = 0; o < out; ++o)
+                for (int k = 0; k <= in; ++k)
+                    w[k < in ? o * in + k : size_t(in) * out + o] += *g++;
+            w += size_t(in + 1) * out;
+        }
+    }
+};
+
+struct Rows {
+    std::vector<float> memory;
+    float* base = nullptr;
+    void reset(int rows) {
+        memory.assign(size_t(rows) * kStride + 16, 0.f);
+        base = memory.data();
+        while (reinterpret_cast<uintptr_t>(base) % 64 != 0) ++base;
+    }
+    float* operator[](int row) { return base + size_t(row) * kStride; }
+    void ones(int row) { std::fill(base + size_t(row) * kStride, base + size_t(row + 1) * kStride, 1.f); }
+};
+
+// Inputs and outputs of every layer of one network for one tile.
+struct Trace {
+    std::vector<Rows> x, cosine;
+    Rows d0, d1;
+    void reset(const Mlp& m, bool train) {
+        x.resize(m.layers() + 1);
+        cosine.resize(train && m.activation == kSine ? m.layers() : 0);
+        int widest = 0;
+        for (int l = 0; l <= m.layers(); ++l) {
+            x[l].reset(m.widths[l] + 1);
+            x[l].ones(m.widths[l]);
+            widest = std::max(widest, m.widths[l]);
+        }
+        for (auto& c : cosine) c.reset(widest);
+        if (train) {
+            d0.reset(widest);
+            d1.reset(widest);
+        }
+    }
+};
+
+DEEP void run_forward(const Net& net, Trace& t, bool train, int n) {
+    const int layers = net.mlp->layers(), act = net.mlp->activation;
+    for (int l = 0; l < layers; ++l) {
+        const Packed& p = net.forward[l];
+        const float* x = t.x[l].base;
+        float* y = t.x[l + 1].base;
+        if (l + 1 == layers || act == kLinear) gemm<kPlain>(p, x, y, nullptr, n);
+        else if (act == kRelu) gemm<kForwardRelu>(p, x, y, nullptr, n);
+        else if (act == kLeaky) gemm<kForwardLeaky>(p, x, y, nullptr, n);
+        else if (train) gemm<kTrainSine>(p, x, y, t.cosine[l].base, n);
+        else gemm<kForwardSine>(p, x, y, nullptr, n);
+    }
+}
+
+// Takes the gradient of the outputs in t.d0; returns that of the features.
+DEEP float* run_backward(Net& net, Trace& t, int n) {
+    const int layers = net.mlp->layers(), act = net.mlp->activation;
+    size_t at = net.mlp->size();
+    float *dy = t.d0.base, *dx = t.d1.base;
+    for (int l = layers - 1; l >= 0; --l) {
+        const int in = net.mlp->widths[l], out = net.mlp->widths[l + 1];
+        at -= size_t(in + 1) * out;
+        outer(dy, t.x[l].base, out, in + 1, n, net.gradient.data() + at);
+        const Packed& p = net.backward[l];
+        if (l == 0 || act == kLinear) gemm<kPlain>(p, dy, dx, nullptr, n);
+        else if (act == kRelu) gemm<kBackRelu>(p, dy, dx, t.x[l].base, n);
+        else if (act == kLeaky) gemm<kBackLeaky>(p, dy, dx, t.x[l].base, n);
+        else gemm<kBackSine>(p, dy, dx, t.cosine[l - 1].base, n);
+        std::swap(dy, dx);
+    }
+    return dy;
+}
