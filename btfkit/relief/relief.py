@@ -1,0 +1,114 @@
+"""The relief of one tile: heights, and how its surface reflects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit.btf import RGB, Wrap
+
+Array = NDArray[np.float32]
+# Heights of more tiles than this are a scale gone wrong, and every ray would cross them all.
+_MOST_HEIGHT = 100.0
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Relief:
+    """Single-valued microgeometry with reflectance maps; what the tracer traces.
+
+    Attributes:
+        height: (h, w) tile widths, positive towards the viewer; z = 0 is the plane uv lives in.
+            Between texel centres heights are bilinear.
+        albedo: (h, w, c) diffuse reflectance, 0..1.
+        specular: (h, w, c) reflectance of the gloss at normal incidence (F0).
+        roughness: (h, w) GGX alpha along the first tangent, 0.02..1.
+        roughness_across: (h, w) GGX alpha along the second tangent; None where isotropic.
+        tangent: (h, w) angle of the first tangent from +x towards +y, radians; None for 0.
+        opacity: (h, w) 0..1, or None for opaque.
+        confidence: (h, w) 0..1, or None.
+        texel_mm: edge of a texel, None where unknown.
+        wrap: "wrap" where the relief tiles, "clamp" where it does not.
+        channels: one name a channel.
+        name, provenance: what it is and where it comes from.
+
+    Raises:
+        ValueError: maps of different sizes, or values that no surface has.
+    """
+
+    height: Array
+    albedo: Array
+    specular: Array
+    roughness: Array
+    roughness_across: Array | None = None
+    tangent: Array | None = None
+    opacity: Array | None = None
+    confidence: Array | None = None
+    texel_mm: float | None = None
+    wrap: Wrap = "wrap"
+    channels: tuple[str, ...] = RGB
+    name: str = ""
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        h, w = self.height.shape
+        c = len(self.channels)
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_SINGLE, (h, w))
+        shapes |= {"albedo": (h, w, c), "specular": (h, w, c)}
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            array = np.ascontiguousarray(value, np.float32)
+            if array.shape != shape:
+                raise ValueError(f"{name} has shape {array.shape}; expected {shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} holds values that are not finite")
+            object.__setattr__(self, name, array)
+        if np.abs(self.height).max() > _MOST_HEIGHT:
+            raise ValueError(
+                f"heights reach {np.abs(self.height).max():g} tile widths; at most {_MOST_HEIGHT:g}"
+            )
+        for name in ("albedo", "specular", "opacity", "confidence"):
+            value = getattr(self, name)
+            if value is not None and (value.min() < 0 or value.max() > 1):
+                raise ValueError(f"{name} ranges {value.min():g}..{value.max():g}; expected 0..1")
+        for name in ("roughness", "roughness_across"):
+            value = getattr(self, name)
+            if value is not None and (value.min() < 0.02 or value.max() > 1):
+                raise ValueError(
+                    f"{name} ranges {value.min():g}..{value.max():g}; expected 0.02..1"
+                )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(h, w)."""
+        return self.height.shape[0], self.height.shape[1]
+
+    @property
+    def aspect(self) -> float:
+        """Tile width / tile height."""
+        return self.height.shape[1] / self.height.shape[0]
+
+    def normals(self) -> Array:
+        """(h, w, 3) unit normals at texel centres, by central differences, surface frame."""
+        h, w = self.height.shape
+        if self.wrap == "wrap":
+            right, left = np.roll(self.height, -1, 1), np.roll(self.height, 1, 1)
+            below, above = np.roll(self.height, -1, 0), np.roll(self.height, 1, 0)
+            dx, dy = (right - left) * (w / 2), (above - below) * (w / 2)
+        else:
+            # A side of one texel has no slope along it.
+            dx = np.gradient(self.height, axis=1) * w if w > 1 else np.zeros((h, w))
+            dy = -np.gradient(self.height, axis=0) * w if h > 1 else np.zeros((h, w))
+        normal = np.stack([-dx, -dy, np.ones((h, w))], axis=-1)
+        return (normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32)
+
+
+_SINGLE = (
+    "height", "roughness", "roughness_across", "tangent", "opacity", "confidence",
+)  # fmt: skip
