@@ -58,7 +58,7 @@ class Pooled:
         self._squared_srgb += float(np.square(to_srgb(a) - to_srgb(t)).sum())
 
     def errors(self) -> dict[str, float]:
-        """mse, psnr, mse_log1p, psnr_log1p, mae and psnr_srgb; ValueError if nothing was counted."""
+        """mse, psnr, mse_log1p, psnr_log1p, mae, psnr_srgb; ValueError if nothing was counted."""
         if not self.values:
             raise ValueError(f"no measured value to compare with; {self.masked} are masked")
         mse, log, srgb = (
@@ -119,7 +119,7 @@ def ssim_srgb(answer: Array, truth: Array) -> float:
             win_size=None if window == 11 else window,
             sigma=1.5,
             use_sample_covariance=False,
-        )  # fmt: skip
+        )
     )
 
 

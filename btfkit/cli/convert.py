@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from btfkit.cli.bar import Bar
 from btfkit.cli.options import SettingType, force_option
 from btfkit.cli.outcome import Outcome, verb
+
+if TYPE_CHECKING:
+    from btfkit.btf import BTF
 
 WRITERS: dict[str, str] = {
     "ubo2003": "btfkit.io.ubo2003",
@@ -38,9 +43,17 @@ def convert_verb(
 ) -> Outcome:
     """Write STORE, or anything `btfkit ingest` reads, in an interchange format."""
     import btfkit
+
+    written(btfkit.open(source), out, kind, dict(settings), force=force, progress=bar)
+    return Outcome(f"{out}: {kind}", {"out": out, "format": kind})
+
+
+def written(
+    btf: BTF, out: Path, kind: str, settings: Mapping[str, str], *, force: bool, progress: Bar
+) -> None:
+    """Write a BTF by the writer of a format, with its own options given as text."""
     from btfkit.cli.settings import matched
 
     module = importlib.import_module(WRITERS[kind])
-    options = matched(module.write, dict(settings))
-    module.write(btfkit.open(source), out, force=force, progress=bar, **options)
-    return Outcome(f"{out}: {kind}", {"out": out, "format": kind})
+    options = matched(module.write, settings)
+    module.write(btf, out, force=force, progress=progress, **options)

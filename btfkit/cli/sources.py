@@ -22,9 +22,9 @@ def read_source(path: Path) -> BTF | QuerySet | Relief:
     if queryfile.detect(path) or path.suffix.lower() == ".npz":
         return queryfile.read(path)
     if path.suffix.lower() == ".exr":
-        from btfkit.relief import file
+        from btfkit.relief.file import read
 
-        return file.read(path)
+        return read(path)
     return btfkit.open(path)
 
 

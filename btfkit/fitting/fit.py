@@ -278,7 +278,7 @@ def _report(
     errors: Mapping[str, Any] = {}
     if len(test) and isinstance(source, BTF):
         errors = errors_on_btf(material, source, pairs=test)
-    elif len(test):
+    elif len(test) and isinstance(source, QuerySet):
         errors = errors_on_queries(material, source.subset(test))
     textures = [n for n in material.weights if "texture" in n]
     sizes = {name: array.size for name, array in material.weights.items()}

@@ -78,7 +78,8 @@ class Encoder(nn.Module):
     def __init__(self, latents: int, generator: torch.Generator) -> None:
         super().__init__()
         self.stem = nn.Conv2d(3, WIDTHS[0], 3)
-        self.down_blocks = nn.ModuleList(Block(width) for width in WIDTHS)
+        # The finest level has no block on its way down: there it would cost as much as all below.
+        self.down_blocks = nn.ModuleList(Block(width) for width in WIDTHS[1:])
         pairs = list(pairwise(WIDTHS))
         self.downs = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in pairs)
         self.gate = Gate(WIDTHS[-1])
@@ -100,11 +101,10 @@ class Encoder(nn.Module):
             raise ValueError(f"guidance of {h} x {w}; expected multiples of {STRIDE}")
         x = self.stem(_circular(guidance, 1))
         skips = []
-        for block, down in zip(self.down_blocks, self.downs, strict=False):
-            x = block(x)
+        for down, block in zip(self.downs, self.down_blocks, strict=True):
             skips.append(x)
-            x = down(x)
-        x = self.gate(self.down_blocks[-1](x))
+            x = block(down(F.gelu(x, approximate="tanh")))
+        x = self.gate(x)
         levels = list(zip(self.ups, self.skips, self.skip_scales, self.up_blocks, strict=True))
         for (up, skip, scale, block), passed in zip(reversed(levels), reversed(skips), strict=True):
             x = F.interpolate(up(x), scale_factor=2.0, mode="nearest") + scale * skip(passed)

@@ -368,7 +368,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _unit(v: Array) -> Array:
-    return v / np.sqrt(np.maximum(_dot(v, v), 1e-30))[:, None]
+    return v / np.sqrt(np.maximum(_dot(v, v), np.float32(1e-30)))[:, None]
 
 
 def _uniform(query: NDArray[np.uint32], index: int, dimension: int, seed: int) -> Array:
