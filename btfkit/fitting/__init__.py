@@ -4,6 +4,8 @@ from __future__ import annotations
 
 # Models that are trained by steps: classes that implement `loop.Trainable`.
 TRAINED: dict[str, str] = {
+    "neumip": "btfkit.fitting.neumip:NeuMIP",
+    "neumip-paper": "btfkit.fitting.neumip:NeuMIPPaper",
     "neubtf": "btfkit.fitting.neubtf:NeuBTF",
 }
 # Models with a closed form: functions (source, *, settings, progress) -> Material.

@@ -5,7 +5,10 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-MODELS: dict[str, str] = {}
+MODELS: dict[str, str] = {
+    "neumip": "btfkit.materials.neumip:NeuMIP",
+    "neumip-paper": "btfkit.materials.neumip:NeuMIPPaper",
+}
 
 
 def material_class(model: str) -> Any:

@@ -1,0 +1,263 @@
+"""What NeuMIP is trained on: random texels of a bounded pool of textures, or rows of queries."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit import directions
+from btfkit.btf import BTF
+from btfkit.errors import FitError
+from btfkit.fitting.pool import Pool
+from btfkit.native.neumip import Array, Draw, Images, draw
+from btfkit.queries import QuerySet
+
+Progress = Callable[[int, int], None]
+# Images that are blurred for the coarser levels: enough directions, bounded time and memory.
+_MOST_BLURRED = 1024
+# Blurs a level is trained at, spread over the octave below it, so that levels between learn too.
+_BLURS = 4
+_HELD_TEXELS = 2048
+_HELD_PAIRS = 16
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """b queries with answers; footprint None is 0.5 throughout, weight None is 1."""
+
+    uv: Array
+    light: Array
+    view: Array
+    footprint: Array | None
+    target: Array
+    weight: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+
+class Source(ABC):
+    """Gives batches; what it gives at a step is decided by seed and step alone.
+
+    Attributes:
+        masked: texels or rows that are not measured.
+    """
+
+    masked: int = 0
+
+    @abstractmethod
+    def batch(self, step: int, count: int) -> Batch:
+        """`count` training queries; arrays may be reused by the next call."""
+
+    @abstractmethod
+    def held_out(self) -> Batch:
+        """A fixed part of the test set, perhaps empty."""
+
+
+@final
+class TexelSource(Source):
+    """Texels of a BTF's training pairs, level 0 sharp, coarser levels from blurred textures."""
+
+    def __init__(
+        self,
+        btf: BTF,
+        train: NDArray[np.intp],
+        test: NDArray[np.intp],
+        *,
+        levels: int,
+        seed: int,
+        pool_bytes: int,
+        progress: Progress | None = None,
+    ) -> None:
+        self._btf, self._test, self._seed = btf, test, seed
+        self._pool = Pool(btf, train, seed=seed, most_bytes=pool_bytes, progress=progress)
+        self.masked = self._pool.masked
+        self._coarse = [self._blurred(level) for level in range(1, levels)]
+        self._room: tuple[Draw, Array] | None = None
+
+    def batch(self, step: int, count: int) -> Batch:
+        self._pool.at_step(step)
+        if self._room is None or len(self._room[1]) != count:
+            self._room = (Draw.empty(count, self._btf.shape[3]), np.full(count, 0.5, np.float32))
+        out, footprint = self._room
+        # Half of the queries are sharp; every further level has a quarter of the texels.
+        at = count
+        seed = int(np.random.SeedSequence([self._seed, step]).generate_state(1, np.uint64)[0])
+        seed >>= 1  # room for one number a query
+        for level, (images, blur) in enumerate(self._coarse):
+            share = max(at // 2, 1) if level == 0 else max(at // 3, 1)
+            part = out.part(at - share, at)
+            draw(images, seed ^ (level + 1) << 40, part)
+            footprint[at - share : at] = blur[part.slots]
+            at -= share
+        draw(self._images(), seed, out.part(0, at))
+        footprint[:at] = 0.5
+        blurred = footprint if self._coarse else None
+        return Batch(out.uv, out.light, out.view, blurred, out.target)
+
+    def held_out(self) -> Batch:
+        rng = np.random.default_rng([self._seed, 7])
+        pairs = rng.permutation(self._test)[:_HELD_PAIRS]
+        h, w = self._btf.shape[1:3]
+        parts = []
+        for pair in pairs:
+            texel = rng.integers(h * w, size=min(_HELD_TEXELS, h * w))
+            row, col = np.divmod(texel, w)
+            uv = np.stack([(col + 0.5) / w, (row + 0.5) / h], axis=1).astype(np.float32)
+            light = self._btf.light_at(int(pair))[row, col]
+            view = self._btf.view_at(int(pair))[row, col]
+            parts.append((uv, light, view, self._btf.texture(int(pair))[row, col]))
+        if not parts:
+            return _nothing(self._btf.shape[3])
+        uv, light, view, rgb = (
+            np.ascontiguousarray(np.concatenate(column), np.float32)
+            for column in zip(*parts, strict=True)
+        )
+        return Batch(uv, light, view, None, rgb)
+
+    def _images(self) -> Images:
+        h, w = self._btf.shape[1:3]
+        phase = np.zeros((len(self._pool.pairs), 2), np.int32)
+        return self._with_directions(self._pool.images, phase, 1, self._pool.pairs, (h, w))
+
+    def _with_directions(
+        self,
+        values: NDArray[np.float16] | NDArray[np.float32],
+        phase: NDArray[np.int32],
+        stride: int,
+        pairs: NDArray[np.intp],
+        grid: tuple[int, int],
+    ) -> Images:
+        btf = self._btf
+        near = [btf.light_position, btf.view_position]
+        texel = btf.texel_mm or 0.0
+        table = [
+            far[pairs] if position is None else position[pairs].astype(np.float32)
+            for far, position in zip((btf.light, btf.view), near, strict=True)
+        ]
+        edges = [0.0 if position is None else texel for position in near]
+        return Images(values, phase, table[0], table[1], grid, stride, edges[0], edges[1])
+
+    def _blurred(self, level: int) -> tuple[Images, Array]:
+        """Every 2^level-th texel of some images, each blurred to a footprint of the octave."""
+        rng = np.random.default_rng([self._seed, level])
+        h, w, c = self._pool.images.shape[1:]
+        most = max(_MOST_BLURRED * 65536 // (h * w), 16)
+        count = min(len(self._pool.pairs), _MOST_BLURRED, most)
+        slots = rng.permutation(len(self._pool.pairs))[:count]
+        stride = 2**level
+        rows, cols = max(h // stride, 1), max(w // stride, 1)
+        values = np.empty((count, rows, cols, c), self._pool.images.dtype)
+        phase = np.stack(
+            [rng.integers(side - (kept - 1) * min(stride, side), size=count)
+             for side, kept in ((h, rows), (w, cols))], axis=1,
+        ).astype(np.int32)  # fmt: skip
+        # A side that a stride no longer divides keeps one texel: its phase says which.
+        blur = (0.5 * 2 ** (level - rng.integers(_BLURS, size=count) / _BLURS)).astype(np.float32)
+        wrap = self._btf.wrap == "wrap"
+        for at, slot in enumerate(slots):
+            variance = float(blur[at]) ** 2 - 0.25
+            down, across = (
+                gaussian(side, variance, wrap=wrap)[first::stride][:kept]
+                for side, first, kept in ((h, phase[at, 0], rows), (w, phase[at, 1], cols))
+            )
+            image = self._pool.images[slot].astype(np.float32)
+            values[at] = blurred(image, down, across)
+        pairs = self._pool.pairs[slots]
+        return self._with_directions(values, phase, stride, pairs, (h, w)), blur
+
+
+@final
+class RowSource(Source):
+    """Rows of a query file with their own footprints, in one shuffled order."""
+
+    def __init__(
+        self, queries: QuerySet, train: NDArray[np.intp], test: NDArray[np.intp], *, seed: int
+    ) -> None:
+        if queries.rgb is None:
+            raise FitError("these queries have no answers (no rgb): there is nothing to fit")
+        usable = queries.valid()
+        train = train[usable[train]]
+        self.masked = int(len(queries) - usable.sum())
+        if not len(train):
+            raise FitError(f"none of {len(queries)} queries is finite and seen from above")
+        rng = np.random.default_rng([seed, 11])
+        # A batch is a run of rows of this order: no gathering while training.
+        self._rows = _rows(queries, rng.permutation(train))
+        held = test[usable[test]]
+        self._held = _rows(queries, rng.permutation(held)[: _HELD_PAIRS * _HELD_TEXELS])
+        self._seed = seed
+
+    def batch(self, step: int, count: int) -> Batch:
+        rows, have = self._rows, len(self._rows)
+        if count >= have:
+            return rows
+        # Every epoch begins elsewhere, so that the same rows do not always meet.
+        a_epoch = have // count
+        epoch, turn = divmod(step, a_epoch)
+        rest = have - a_epoch * count
+        first = np.random.default_rng([self._seed, epoch]).integers(rest + 1) + turn * count
+        cut = slice(int(first), int(first) + count)
+        return _cut(rows, cut)
+
+    def held_out(self) -> Batch:
+        return self._held
+
+
+@lru_cache(maxsize=8)
+def gaussian(side: int, variance: float, *, wrap: bool) -> Array:
+    """(side, side) matrix that blurs a column of texels; rows sum to 1, borders wrap or clamp.
+
+    Args:
+        side: texels. variance: of the Gaussian, texels squared.
+    """
+    if variance <= 0:
+        return np.eye(side, dtype=np.float32)
+    reach = math.ceil(4 * math.sqrt(variance))
+    steps = np.arange(-reach, reach + 1)
+    weight = np.exp(-(steps**2) / (2 * variance))
+    weight /= weight.sum()
+    matrix = np.zeros((side, side))
+    at = np.arange(side)[:, None] + steps
+    at = at % side if wrap else np.clip(at, 0, side - 1)
+    np.add.at(matrix, (np.arange(side)[:, None], at), weight)
+    return matrix.astype(np.float32)
+
+
+def blurred(image: Array, down: Array, across: Array) -> Array:
+    """down @ image @ across^T of an image (h, w, c); NaN where less than half is measured."""
+    finite = np.isfinite(image)
+    if finite.all():
+        return np.einsum("ij,jwc,kw->ikc", down, image, across, optimize=True)
+    known = np.einsum("ij,jwc,kw->ikc", down, finite.astype(np.float32), across, optimize=True)
+    filled = np.where(finite, image, np.float32(0))
+    total = np.einsum("ij,jwc,kw->ikc", down, filled, across, optimize=True)
+    return np.where(known >= 0.5, total / np.maximum(known, 1e-6), np.float32(np.nan))
+
+
+def _rows(queries: QuerySet, rows: NDArray[np.intp]) -> Batch:
+    assert queries.rgb is not None
+    unit = (directions.normalize(d[rows]).astype(np.float32) for d in (queries.light, queries.view))
+    footprint = None if queries.footprint is None else queries.footprint[rows]
+    weight = None if queries.weight is None else queries.weight[rows]
+    light, view = unit
+    return Batch(queries.uv[rows], light, view, footprint, queries.rgb[rows], weight)
+
+
+def _cut(rows: Batch, at: slice) -> Batch:
+    footprint = None if rows.footprint is None else rows.footprint[at]
+    weight = None if rows.weight is None else rows.weight[at]
+    return Batch(rows.uv[at], rows.light[at], rows.view[at], footprint, rows.target[at], weight)
+
+
+def _nothing(channels: int) -> Batch:
+    arrays = [np.empty((0, size), np.float32) for size in (2, 3, 3, channels)]
+    return Batch(arrays[0], arrays[1], arrays[2], None, arrays[3])
