@@ -19,8 +19,15 @@ from btfkit.errors import FormatError
 # The order is the order of detection: the more specific first.
 FORMATS: dict[str, str] = {
     "zarr": "btfkit.io.store",
+    "axf": "btfkit.io.axf",
+    "spectral": "btfkit.io.spectral",
     "ubo2003": "btfkit.io.ubo2003",
     "utia": "btfkit.io.utia",
+    "materialgan": "btfkit.io.materialgan",
+    "diligent": "btfkit.io.diligent",
+    "lp": "btfkit.io.lp",
+    "merl": "btfkit.io.merl",
+    "utia_brdf": "btfkit.io.utia_brdf",
 }
 
 

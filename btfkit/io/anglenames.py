@@ -57,8 +57,7 @@ def ordered(path: str, names: list[str]) -> list[tuple[str, Angles]]:
     for name, a in parsed:
         if not (0 <= a.tl <= 90 and 0 <= a.tv <= 90 and abs(a.pl) <= 360 and abs(a.pv) <= 360):
             raise FormatError(path, f"{name}: angles {a} are not on the hemisphere")
-        # At the pole every azimuth is the same direction.
-        key = (a.tl, a.pl % 360 if a.tl else 0.0, a.tv, a.pv % 360 if a.tv else 0.0)
+        key = (*_direction(a.tl, a.pl), *_direction(a.tv, a.pv))
         if key in seen:
             raise FormatError(
                 path, f"{name} and {seen[key]} are the same direction pair", remedy="remove one"
@@ -80,6 +79,11 @@ def light_and_view(
 
 def missing_pairs(angles: list[Angles]) -> int:
     """How many pairs the product of the views and lights that occur lacks."""
-    lights = {(a.tl, a.pl) for a in angles}
-    views = {(a.tv, a.pv) for a in angles}
+    lights = {_direction(a.tl, a.pl) for a in angles}
+    views = {_direction(a.tv, a.pv) for a in angles}
     return len(lights) * len(views) - len(angles)
+
+
+def _direction(theta: float, phi: float) -> tuple[float, float]:
+    """Angles that are equal where the directions are: at the pole every azimuth is the same."""
+    return theta, phi % 360 if theta else 0.0

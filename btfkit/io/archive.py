@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import posixpath
 import threading
 import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
 from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from btfkit.errors import FormatError
 
@@ -14,6 +18,7 @@ from btfkit.errors import FormatError
 _MOST_BYTES = 1 << 31
 # Deflate shrinks at most 1032 times; images hardly at all.
 _MOST_RATIO = 200
+_MOST_TEXT = 1 << 28
 _IGNORED = {"thumbs.db", ".ds_store", "desktop.ini"}
 
 
@@ -32,6 +37,7 @@ class Archive:
         self.path = path
         self._local = threading.local()
         self._zip = not path.is_dir()
+        self._by_last: dict[str, list[str]] = {}
         self._infos: dict[str, zipfile.ZipInfo] = {}
         if self._zip:
             self._infos = self._checked()
@@ -71,6 +77,68 @@ class Archive:
                 self.path, f"member {name!r} does not have the {info.file_size} bytes it says"
             )
         return data
+
+    def text(self, name: str) -> str:
+        """A member as text, UTF-8 or else Latin-1.
+
+        Raises:
+            FormatError: binary, or far too long for a text that somebody wrote.
+        """
+        data = self.read(name)
+        if len(data) > _MOST_TEXT or b"\0" in data:
+            raise FormatError(self.path / name, "not a text file")
+        try:
+            return data.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            return data.decode("latin-1")
+
+    def table(self, name: str, columns: int) -> NDArray[np.float64]:
+        """(rows, columns) numbers of a text member, separated by commas or white space.
+
+        Raises:
+            FormatError: a line that has not so many finite numbers, or no line at all.
+        """
+        rows = []
+        for number, line in enumerate(self.text(name).splitlines(), 1):
+            words = line.replace(",", " ").split()
+            if not words:
+                continue
+            try:
+                row = [float(word) for word in words]
+            except ValueError:
+                row = []
+            if len(row) != columns or not np.isfinite(row).all():
+                raise FormatError(
+                    self.path / name, f"line {number} is {line[:60]!r}; expected {columns} numbers"
+                )
+            rows.append(row)
+        if not rows:
+            raise FormatError(self.path / name, "holds no numbers")
+        return np.array(rows)
+
+    def locate(self, name: str, base: str = "") -> str | None:
+        """The member that a text file means by a name; None where there is none.
+
+        Args:
+            name: relative to `base`, or a path of another machine, whose last part counts.
+            base: folder of the text file, "" for the archive itself.
+
+        Raises:
+            FormatError: several members have that last part.
+        """
+        plain = name.replace("\\", "/")
+        if not self._by_last:
+            for member in self.names:
+                self._by_last.setdefault(PurePosixPath(member).name.lower(), []).append(member)
+        relative = posixpath.normpath(posixpath.join(base, plain))
+        found = self._by_last.get(PurePosixPath(plain).name.lower(), [])
+        if relative in found:
+            return relative
+        if len(found) > 1:
+            raise FormatError(
+                self.path, f"{name!r} may be any of {', '.join(found[:3])}", remedy="rename them"
+            )
+        return found[0] if found else None
 
     def _checked(self) -> dict[str, zipfile.ZipInfo]:
         infos: dict[str, zipfile.ZipInfo] = {}
@@ -118,6 +186,17 @@ def names_of(path: Path) -> list[str]:
     except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError):
         return []
     return []
+
+
+def folder_with(names: list[str], *required: str) -> str | None:
+    """The folder of a listing that holds all the `required` files; the highest of several."""
+    present = {PurePosixPath(name.replace("\\", "/")) for name in names}
+    folders = {path.parent for path in present if path.name == required[0]}
+    found = [f for f in folders if all(f / name in present for name in required)]
+    if not found:
+        return None
+    best = min(found, key=lambda folder: (len(folder.parts), str(folder)))
+    return "" if best == PurePosixPath(".") else str(best)
 
 
 def _counts(path: Path | PurePosixPath) -> bool:

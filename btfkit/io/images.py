@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import os
-import re
 import struct
 import tempfile
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from btfkit import colour
 from btfkit.errors import FormatError
+from btfkit.io import radiance
+from btfkit.io.radiance import check_size
 
 Array = NDArray[np.float32]
+T = TypeVar("T")
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr", ".bmp"}
-# A side that long, or that many values, is a damaged header.
-_MOST_SIDE, _MOST_VALUES = 1 << 16, 1 << 30
 
 
 def is_image(name: str) -> bool:
@@ -46,14 +47,15 @@ def read(name: str, data: bytes, *, transfer: str) -> Array:
     if suffix == ".exr":
         return read_exr(name, data)[0]
     if suffix == ".hdr" or data[:2] == b"#?":
-        return read_hdr(name, data)
+        return radiance.read(name, data)
     return _read_codes(name, data, transfer)
 
 
 def _read_codes(name: str, data: bytes, transfer: str) -> Array:
     import cv2
 
-    _check_size(name, *size_of(name, data))
+    check_size(name, *size_of(name, data))
+    _check_whole(name, data)
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
     try:
         codes = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -61,10 +63,6 @@ def _read_codes(name: str, data: bytes, transfer: str) -> Array:
         raise FormatError(name, f"not a readable image ({error})") from error
     if codes is None:
         raise FormatError(name, "not a readable image", remedy="copy it again")
-    for magic, ending in ((b"\xff\xd8", b"\xff\xd9"), (b"\x89PNG", b"IEND")):
-        # Decoders fill what a cut file lacks with grey and say nothing.
-        if data.startswith(magic) and ending not in data[-4096:]:
-            raise FormatError(name, "the image is cut short", remedy="copy it again")
     if codes.ndim == 2:
         codes = codes[..., None]
     if codes.shape[2] == 3:
@@ -74,6 +72,24 @@ def _read_codes(name: str, data: bytes, transfer: str) -> Array:
     if codes.dtype == np.float32:
         return np.ascontiguousarray(codes)
     raise FormatError(name, f"pixels are {codes.dtype}; expected 8 or 16 bit, or float32")
+
+
+def _check_whole(name: str, data: bytes) -> None:
+    """Refuse what decoders fill with grey or noise without a word: cut files, damaged chunks."""
+    if data.startswith(b"\xff\xd8") and b"\xff\xd9" not in data[-4096:]:
+        raise FormatError(name, "the image is cut short", remedy="copy it again")
+    if not data.startswith(b"\x89PNG"):
+        return
+    at, kind = 8, b""
+    while kind != b"IEND":
+        size = int.from_bytes(data[at : at + 4], "big")
+        kind = data[at + 4 : at + 8]
+        end = at + 8 + size
+        if end + 4 > len(data):
+            raise FormatError(name, "the image is cut short", remedy="copy it again")
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            raise FormatError(name, f"chunk {kind!r} of the PNG is damaged", remedy="copy it again")
+        at = end + 4
 
 
 def size_of(name: str, data: bytes) -> tuple[int, int]:
@@ -93,17 +109,39 @@ def size_of(name: str, data: bytes) -> tuple[int, int]:
         ) from error
 
 
-def _check_size(name: str, h: int, w: int, channels: int = 3) -> None:
-    if not (0 < h <= _MOST_SIDE and 0 < w <= _MOST_SIDE) or h * w * channels > _MOST_VALUES:
-        raise FormatError(name, f"declares {h} x {w} x {channels} values")
+def exr_channels(name: str, data: bytes) -> tuple[str, ...]:
+    """Channel names of an EXR as they stand in its header, which alone is decoded."""
+    return _with_exr(name, data, lambda source: tuple(source.spec().channelnames))
 
 
 def read_exr(name: str, data: bytes) -> tuple[Array, tuple[str, ...], dict[str, Any]]:
     """An EXR: (h, w, c) float32, channel names (R, G, B first), and its attributes.
 
     Raises:
-        FormatError: not an EXR, damaged, or absurdly large.
+        FormatError: not an EXR, damaged, deep, or absurdly large.
     """
+    import OpenImageIO as oiio
+
+    def decode(source: Any) -> tuple[Array, Any]:
+        spec = source.spec()
+        if spec.deep:
+            raise FormatError(name, "the EXR is deep; expected flat pixels")
+        check_size(name, spec.height, spec.width, spec.nchannels)
+        pixels = source.read_image(oiio.FLOAT)
+        fault = source.geterror()
+        if pixels is None or fault:
+            raise FormatError(name, f"the EXR cannot be decoded ({fault})", remedy="copy it again")
+        return _in_display_window(name, np.asarray(pixels, np.float32), spec), spec
+
+    values, spec = _with_exr(name, data, decode)
+    names = tuple(spec.channelnames)
+    order = sorted(range(len(names)), key=lambda i: (_RGB.get(names[i], 3), i))
+    attributes = {attribute.name: attribute.value for attribute in spec.extra_attribs}
+    return np.ascontiguousarray(values[..., order]), tuple(names[i] for i in order), attributes
+
+
+def _with_exr(name: str, data: bytes, use: Callable[[Any], T]) -> T:
+    """What `use` makes of the opened EXR."""
     import OpenImageIO as oiio
 
     if data[:4] != b"v/1\x01":
@@ -116,108 +154,33 @@ def read_exr(name: str, data: bytes) -> tuple[Array, tuple[str, ...], dict[str, 
         if source is None:
             raise FormatError(name, f"the EXR cannot be opened ({oiio.geterror()})")
         try:
-            spec = source.spec()
-            _check_size(name, spec.height, spec.width, spec.nchannels)
-            pixels = source.read_image(oiio.FLOAT)
-            fault = source.geterror()
+            return use(source)
         finally:
             source.close()
-    if pixels is None or fault:
-        raise FormatError(name, f"the EXR cannot be decoded ({fault})", remedy="copy it again")
-    names = tuple(spec.channelnames)
-    order = sorted(range(len(names)), key=lambda i: (_RGB.get(names[i], 3), i))
-    values = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, -1)[..., order]
-    attributes = {attribute.name: attribute.value for attribute in spec.extra_attribs}
-    return np.ascontiguousarray(values), tuple(names[i] for i in order), attributes
+
+
+def _in_display_window(name: str, pixels: Array, spec: Any) -> Array:
+    """The whole picture of an EXR that stores a part of it; NaN where it stores nothing."""
+    data_window = (spec.y, spec.x, spec.height, spec.width)
+    display = (spec.full_y, spec.full_x, spec.full_height, spec.full_width)
+    values = pixels.reshape(spec.height, spec.width, -1)
+    if data_window == display:
+        return values
+    check_size(name, spec.full_height, spec.full_width, spec.nchannels)
+    row, col = spec.y - spec.full_y, spec.x - spec.full_x
+    out = np.full((spec.full_height, spec.full_width, spec.nchannels), np.nan, np.float32)
+    top, left = max(row, 0), max(col, 0)
+    bottom, right = (
+        max(spec.full_height - row, 0),
+        max(spec.full_width - col, 0),
+    )
+    inside = values[top - row : bottom, left - col : right]
+    if inside.size:
+        out[top : top + inside.shape[0], left : left + inside.shape[1]] = inside
+    return out
 
 
 _RGB = {"R": 0, "G": 1, "B": 2}
-_RESOLUTION = re.compile(rb"([-+])([XY]) +(\d+) +([-+])([XY]) +(\d+)")
-
-
-def read_hdr(name: str, data: bytes, *, orientation: str = "standard") -> Array:
-    """A Radiance picture (RGBE) in any of the eight orientations its resolution line can say.
-
-    Args:
-        name: for messages.
-        data: the bytes of the file.
-        orientation: "standard" follows the resolution line; "btf_extractor" takes the values as
-            rows from the bottom up whatever the line says, as that reader of ATRIUM does.
-
-    Returns:
-        (h, w, 3) linear float32, row 0 on top.
-
-    Raises:
-        FormatError: not a Radiance picture, damaged, or absurdly large.
-    """
-    blank = data.find(b"\n\n")
-    end = data.find(b"\n", blank + 2)
-    match = _RESOLUTION.fullmatch(data[blank + 2 : end].strip()) if 0 <= blank < end else None
-    if data[:2] != b"#?" or match is None:
-        raise FormatError(name, "not a Radiance picture: no resolution line after the header")
-    if b"FORMAT=32-bit_rle_xyze" in data[:blank]:
-        raise FormatError(name, "the Radiance picture holds XYZ; expected RGB")
-    first_sign, first, count, second_sign, second, length = match.groups()
-    scanlines, pixels = int(count), int(length)
-    if first == second:
-        raise FormatError(name, f"resolution line {match[0].decode()!r} names one axis twice")
-    _check_size(name, scanlines, pixels)
-    rgbe = _scanlines(name, data, end + 1, scanlines, pixels)
-    # Ward: the value of a mantissa m with exponent e is (m + 0.5) 2^(e - 136), black where e = 0.
-    exponent = rgbe[..., 3].astype(np.int32)
-    scale = np.where(exponent > 0, np.ldexp(np.float32(1), exponent - 136), np.float32(0))
-    image = (rgbe[..., :3] + np.float32(0.5)) * scale[..., None]
-    if orientation == "btf_extractor":
-        return np.ascontiguousarray(image[::-1], np.float32)
-    if orientation != "standard":
-        raise ValueError(f"orientation {orientation!r}; expected standard or btf_extractor")
-    # -Y runs down the rows, +X along the columns; the first axis counts scanlines.
-    if (first_sign == b"-") == (first == b"X"):
-        image = image[::-1]
-    if (second_sign == b"-") == (second == b"X"):
-        image = image[:, ::-1]
-    if first == b"X":
-        image = image.transpose(1, 0, 2)
-    return np.ascontiguousarray(image, np.float32)
-
-
-def _scanlines(name: str, data: bytes, at: int, count: int, length: int) -> NDArray[np.uint8]:
-    """(count, length, 4) RGBE of flat or new-style run-length encoded scanlines."""
-    flat = 4 * count * length
-    if data[at : at + 2] != b"\x02\x02" or not 8 <= length < 32768:
-        if len(data) - at < flat:
-            raise FormatError(name, f"{len(data) - at} bytes of pixels; expected {flat}")
-        return np.frombuffer(data, np.uint8, flat, at).reshape(count, length, 4)
-    if len(data) - at < 4 * count:
-        raise FormatError(name, f"cut short: {len(data) - at} bytes for {count} scanlines")
-    out = np.empty((count, 4, length), np.uint8)
-    for line in range(count):
-        if data[at : at + 2] != b"\x02\x02" or data[at + 2] << 8 | data[at + 3] != length:
-            raise FormatError(name, f"scanline {line} does not start with its length {length}")
-        at += 4
-        for channel in range(4):
-            at = _runs(name, data, at, out[line, channel])
-    return out.transpose(0, 2, 1)
-
-
-def _runs(name: str, data: bytes, at: int, out: NDArray[np.uint8]) -> int:
-    """Fill one channel of a scanline from runs; returns where the next begins."""
-    filled = 0
-    while filled < len(out):
-        if at >= len(data):
-            raise FormatError(name, "the run-length code is cut short")
-        code = data[at]
-        size = code - 128 if code > 128 else code
-        needed = 2 if code > 128 else 1 + size
-        if size == 0 or filled + size > len(out) or at + needed > len(data):
-            raise FormatError(name, f"the run-length code is damaged at byte {at}")
-        if code > 128:
-            out[filled : filled + size] = data[at + 1]
-        else:
-            out[filled : filled + size] = np.frombuffer(data, np.uint8, size, at + 1)
-        filled += size
-        at += needed
-    return at
 
 
 def encode_jpeg(linear: Array, *, quality: int = 100) -> bytes:

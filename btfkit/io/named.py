@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import os
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
@@ -11,11 +13,14 @@ import numpy as np
 
 from btfkit.btf import BTF, RGB
 from btfkit.errors import FormatError
-from btfkit.io import anglenames, images
+from btfkit.io import anglenames, images, radiance
+from btfkit.io.anglenames import Angles
 from btfkit.io.archive import Archive
 from btfkit.textures import Array, Textures
 
 Decode = Callable[[str, bytes], Array]
+# Pair, h and w to factors that broadcast against (h, w, c).
+Scale = Callable[[int, int, int], Array]
 
 
 @final
@@ -26,18 +31,24 @@ class ImageTextures(Textures):
         archive: where the members lie.
         names: (n,) members.
         decode: name and bytes to (h, w, c) float32.
-        scale: (n, ...) factors that broadcast against (h, w, c), or None.
+        scale: what the values of a pair are multiplied by, or None.
 
     Raises:
         FormatError: the first member cannot be decoded; its size is everybody's.
     """
 
     def __init__(
-        self, archive: Archive, names: list[str], decode: Decode, scale: Array | None = None
+        self, archive: Archive, names: list[str], decode: Decode, scale: Scale | None = None
     ) -> None:
         self._archive, self._names, self._decode, self._scale = archive, names, decode, scale
         first = decode(names[0], archive.read(names[0]))
         self.shape = (len(names), *first.shape)
+
+    def scaled(self, scale: Scale) -> ImageTextures:
+        """The same members with other factors; nothing is decoded."""
+        other = copy.copy(self)
+        other._scale = scale
+        return other
 
     def _read(self, index: int) -> Array:
         name = self._names[index]
@@ -48,7 +59,9 @@ class ImageTextures(Textures):
                 f"is {' x '.join(map(str, image.shape))}; the first image is "
                 f"{' x '.join(map(str, self.shape[1:]))}",
             )
-        return image if self._scale is None else image * self._scale[index]
+        if self._scale is None:
+            return image
+        return image * self._scale(index, *image.shape[:2])
 
 
 def read_named(
@@ -57,8 +70,10 @@ def read_named(
     *,
     suffixes: set[str],
     cosine: str = "in",
-    channels: tuple[str, ...] | None = None,
+    channels: Callable[[], tuple[str, ...]] | None = None,
+    number: Callable[[Angles], int] | None = None,
     provenance: Mapping[str, Any],
+    **more: Any,
 ) -> BTF:
     """A BTF of images named by their angles.
 
@@ -67,8 +82,11 @@ def read_named(
         decode: name and bytes to linear values.
         suffixes: of the images; other members are left alone.
         cosine: "in" where the data hold the cosine of the light, "out" where it is divided out.
-        channels: names; None takes RGB or Y by the count.
+        channels: names, asked for once the first image is decoded; None takes RGB or Y by the
+            count.
+        number: the running number that a name with these angles ought to have; -1 for any.
         provenance: format, options and assumptions.
+        **more: further fields of the BTF.
 
     Raises:
         FormatError: no image with all four angles, or one pair twice.
@@ -78,35 +96,82 @@ def read_named(
     pairs = anglenames.ordered(str(path), names)
     if not pairs:
         raise FormatError(path, f"none of {len(names)} images is named by its four angles")
-    unnamed = len(names) - len(pairs)
-    missing = anglenames.missing_pairs([angles for _, angles in pairs])
-    if missing or unnamed:
+    angles = [each for _, each in pairs]
+    record = {
+        "missing_pairs": anglenames.missing_pairs(angles),
+        "unnamed_images": len(names) - len(pairs),
+        "misnumbered_images": sum(
+            a.number >= 0 and number(a) not in (-1, a.number) for a in angles if number
+        ),
+    }
+    if any(record.values()):
         warnings.warn(
-            f"{path}: {missing} pairs of the product of its lights and views are missing, "
-            f"{unnamed} images are not named by angles",
+            f"{path}: {record['missing_pairs']} pairs of the product of its lights and views are "
+            f"missing, {record['unnamed_images']} images are not named by angles, "
+            f"{record['misnumbered_images']} have a running number that their angles contradict "
+            "(the angles count)",
             stacklevel=3,
         )
-    light, view = anglenames.light_and_view([angles for _, angles in pairs])
+    light, view = anglenames.light_and_view(angles)
     textures = ImageTextures(
         archive, [name for name, _ in pairs], decode, cosine_factor(cosine, light)
     )
-    c = textures.shape[3]
-    return BTF(
-        textures=textures,
+    return assembled(
+        path,
+        textures,
         light=light,
         view=view,
-        channels=channels or (RGB if c == 3 else ("Y",)),
-        provenance={"source": str(path), "missing_pairs": missing, **provenance},
+        channels=channels and channels(),
+        provenance={"source": str(path), **record, **provenance},
+        **more,
     )
 
 
-def cosine_factor(cosine: str, light: np.ndarray[Any, Any]) -> Array | None:
-    """(n, 1, 1, 1) factors that put the cosine of the light in; None where it is in."""
+def assembled(
+    path: Path, textures: Textures, *, provenance: Mapping[str, Any], **fields: Any
+) -> BTF:
+    """A BTF of what a file says; what no BTF can be is the file's fault.
+
+    Args:
+        path: for messages.
+        textures: (n, h, w, c).
+        provenance: of the BTF.
+        **fields: other fields of the BTF; channels None takes RGB or Y by the count.
+
+    Raises:
+        FormatError: the parts do not fit, a direction is none, or a pair is there twice.
+    """
+    if fields.get("channels") is None:
+        c = textures.shape[3]
+        if c not in (1, 3):
+            raise FormatError(path, f"images of {c} channels; expected 1 or 3")
+        fields["channels"] = RGB if c == 3 else ("Y",)
+    try:
+        btf = BTF(textures=textures, provenance=dict(provenance), **fields)
+    except ValueError as error:
+        raise FormatError(path, str(error)) from error
+    poses = [btf.light, btf.view, btf.light_position, btf.view_position]
+    rows = np.concatenate([pose for pose in poses if pose is not None], axis=1)
+    _, first, index = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    if len(first) < len(btf):
+        again = next(i for i, row in enumerate(index.reshape(-1)) if first[row] != i)
+        raise FormatError(
+            path,
+            f"images {first[index.reshape(-1)[again]]} and {again} (from 0) have the same light "
+            "and view",
+            remedy="remove one",
+        )
+    return btf
+
+
+def cosine_factor(cosine: str, light: np.ndarray[Any, Any]) -> Scale | None:
+    """What puts the cosine of far lights (n, 3) into values; None where it is in them."""
     if cosine == "in":
         return None
     if cosine != "out":
         raise ValueError(f"cosine {cosine!r}; expected in or out")
-    return np.maximum(light[:, 2], 0).astype(np.float32)[:, None, None, None]
+    factors = np.maximum(light[:, 2], 0).astype(np.float32)
+    return lambda index, h, w: factors[index]
 
 
 def assumptions(**options: tuple[Any, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -124,13 +189,36 @@ def assumptions(**options: tuple[Any, Any]) -> tuple[dict[str, Any], dict[str, A
     return values, {"options": given, "assumed": assumed}
 
 
-def looks_named(names: list[str], separator: str, suffixes: set[str]) -> bool:
-    """Whether the first images of a listing are named by angles with this separator between."""
+@final
+class Lost:
+    """Counts what 8-bit images cannot hold."""
+
+    def __init__(self) -> None:
+        self.outside = self.unmeasured = 0
+
+    def count(self, texture: Array) -> Array:
+        """`texture`, counted."""
+        self.outside += int(np.count_nonzero((texture < 0) | (texture > 1)))
+        self.unmeasured += int(np.count_nonzero(np.isnan(texture)))
+        return texture
+
+    def warn(self, path: str | os.PathLike[str], *, remedy: str) -> None:
+        """Say what was lost, if anything was."""
+        if self.outside or self.unmeasured:
+            warnings.warn(
+                f"{os.fspath(path)}: {self.outside} values outside 0..1 were clamped and "
+                f"{self.unmeasured} that were not measured written as 0; {remedy}",
+                stacklevel=3,
+            )
+
+
+def looks_named(names: list[str], suffixes: set[str], *, spaces: bool) -> bool:
+    """Whether one of the first images is named by angles, with or without spaces between."""
     candidates = [n for n in names if PurePosixPath(n).suffix.lower() in suffixes]
     for name in candidates[:20]:
-        base = PurePosixPath(name).name
-        if anglenames.parse(base) and separator in base.split(".")[0].lstrip("0123456789 "):
-            return True
+        angles = anglenames.parse(name)
+        if angles is not None:
+            return (" " in PurePosixPath(name).stem.strip()) == spaces
     return False
 
 
@@ -139,7 +227,7 @@ def decode_image(transfer: str, orientation: str = "standard") -> Decode:
 
     def decode(name: str, data: bytes) -> Array:
         if data[:2] == b"#?":
-            return images.read_hdr(name, data, orientation=orientation)
+            return radiance.read(name, data, orientation=orientation)
         return images.read(name, data, transfer=transfer)
 
     return decode

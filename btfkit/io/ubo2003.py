@@ -8,6 +8,7 @@ frontal view; phi = 0 is image +x and phi grows counter-clockwise, y up.
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -18,13 +19,14 @@ from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.files import whole_folder
 from btfkit.io import archive, images, named
+from btfkit.io.anglenames import Angles
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".hdr"}
 
 
 def detect(path: Path) -> bool:
     """Whether images named `... tl000 pl000 tv000 pv000.*` lie in a folder or zip; names only."""
-    return named.looks_named(archive.names_of(path), " ", SUFFIXES)
+    return named.looks_named(archive.names_of(path), SUFFIXES, spaces=True)
 
 
 def read(
@@ -57,6 +59,7 @@ def read(
         named.decode_image(values["transfer"], values["orientation"]),
         suffixes=SUFFIXES,
         cosine=values["cosine"],
+        number=_running_number,
         provenance={"format": "ubo2003", **record},
     )
 
@@ -79,27 +82,33 @@ def write(
         progress: called with (images written, n).
 
     Raises:
-        ValueError: two pairs that would have the same name.
+        ValueError: channels that a JPEG does not have, or two pairs with the same name.
     """
+    if btf.shape[3] not in (1, 3):
+        raise ValueError(f"UBO2003 files hold 1 or 3 channels; the BTF has {btf.shape[3]}")
     names = _names(btf)
+    lost = named.Lost()
     with whole_folder(path, force=force) as folder:
         for pair, name in enumerate(names):
             file = folder / name
             file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(images.encode_jpeg(btf.texture(pair), quality=quality))
+            texture = lost.count(btf.texture(pair))
+            file.write_bytes(images.encode_jpeg(texture, quality=quality))
             if progress:
                 progress(pair + 1, len(btf))
+    lost.warn(path, remedy="manifest keeps them")
 
 
 def _names(btf: BTF) -> list[str]:
-    """Relative names: 81 (or as many as there are) * light + view, and the four angles."""
+    """Relative names: running number (81 * light + view where they are Bonn's), four angles."""
     lights, light_index = directions.unique(btf.light)
     views, view_index = directions.unique(btf.view)
     light_degrees, view_degrees = (_whole_degrees(table) for table in (lights, views))
     names = []
     for i, j in zip(light_index, view_index, strict=True):
         (tl, pl), (tv, pv) = light_degrees[i], view_degrees[j]
-        number = len(views) * i + j
+        number = _running_number(Angles(tl, pl, tv, pv))
+        number = number if number >= 0 else len(views) * int(i) + int(j)
         base = f"{number:05d} tl{tl:03d} pl{pl:03d} tv{tv:03d} pv{pv:03d}.jpg"
         names.append(f"tv{tv:03d}_pv{pv:03d}/{base}")
     if len({name.split(" ", 1)[1] for name in names}) < len(names):
@@ -108,6 +117,19 @@ def _names(btf: BTF) -> list[str]:
             "write utia or manifest instead"
         )
     return names
+
+
+@functools.cache
+def _bonn81() -> dict[tuple[float, float], int]:
+    degrees = _whole_degrees(directions.bonn81())
+    return {angles: index for index, angles in enumerate(degrees)}
+
+
+def _running_number(angles: Angles) -> int:
+    """81 * light + view as in Bonn's table of 81 directions; -1 for directions outside it."""
+    light = _bonn81().get((angles.tl, angles.pl % 360 if angles.tl else 0))
+    view = _bonn81().get((angles.tv, angles.pv % 360 if angles.tv else 0))
+    return -1 if light is None or view is None else 81 * light + view
 
 
 def _whole_degrees(table: np.ndarray) -> list[tuple[int, int]]:

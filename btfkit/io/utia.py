@@ -27,7 +27,7 @@ SUFFIXES = {".png", ".exr", ".jpg", ".jpeg"}
 
 def detect(path: Path) -> bool:
     """Whether images named `tl000_pl000_tv000_pv000.*` lie in a folder or zip; names only."""
-    return named.looks_named(archive.names_of(path), "_", SUFFIXES)
+    return named.looks_named(archive.names_of(path), SUFFIXES, spaces=False)
 
 
 def read(
@@ -121,15 +121,16 @@ def write(
         progress: called with (images written, n).
 
     Raises:
-        ValueError: not three channels.
+        ValueError: not three channels, or two pairs with the same name.
     """
     if btf.shape[3] != 3:
         raise ValueError(f"UTIA files hold three channels; the BTF has {btf.shape[3]}")
+    names = [_name(btf.light[i], btf.view[i], exr) for i in range(len(btf))]
+    if len(set(names)) < len(names):
+        raise ValueError("two pairs are closer than 0.01 degrees; write manifest instead")
+    lost = named.Lost()
     with whole_folder(path, force=force) as folder:
-        for pair in range(len(btf)):
-            tl, pl = _degrees(btf.light[pair])
-            tv, pv = _degrees(btf.view[pair])
-            name = f"tv{tv}_pv{pv}/tl{tl}_pl{pl}_tv{tv}_pv{pv}.{'exr' if exr else 'png'}"
+        for pair, name in enumerate(names):
             file = folder / name
             file.parent.mkdir(exist_ok=True)
             texture = btf.texture(pair)
@@ -137,9 +138,15 @@ def write(
                 xyz = colour.rgb_to_xyz(texture).astype(np.float16)
                 images.write_exr(file, xyz, ("R", "G", "B"))
             else:
-                file.write_bytes(images.encode_png(texture))
+                file.write_bytes(images.encode_png(lost.count(texture)))
             if progress:
                 progress(pair + 1, len(btf))
+    lost.warn(path, remedy="EXR (exr=True) keeps them")
+
+
+def _name(light: Array, view: Array, exr: bool) -> str:
+    (tl, pl), (tv, pv) = _degrees(light), _degrees(view)
+    return f"tv{tv}_pv{pv}/tl{tl}_pl{pl}_tv{tv}_pv{pv}.{'exr' if exr else 'png'}"
 
 
 def _degrees(direction: Array) -> tuple[str, str]:

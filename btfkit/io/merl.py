@@ -1,0 +1,112 @@
+"""MERL BRDFs (`*.binary`) as BTFs of one texel.
+
+    int32 x 3                90, 90, 180: bins of theta_half, theta_diff, phi_diff
+    float64 x 3 x 1458000    red, green and blue planes, phi_diff fastest
+
+theta_half is spaced by its square root. Values are f_r / scale; negative ones are invalid.
+Source: Matusik et al., "A Data-Driven Reflectance Model", 2003, and their BRDFRead.cpp.
+"""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit import directions
+from btfkit.btf import BTF
+from btfkit.errors import FormatError
+from btfkit.io import named
+from btfkit.textures import as_textures
+
+_BINS = (90, 90, 180)
+_SCALE = np.array([1.0, 1.15, 1.66]) / 1500
+_TABLES = {"bonn81": directions.bonn81, "bonn151": directions.bonn151}
+
+
+def detect(path: Path) -> bool:
+    """Whether a file starts with MERL's numbers of bins, or is named *.binary."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        start = file.read(8)
+    return start == np.array(_BINS[:2], "<i4").tobytes() or path.suffix.lower() == ".binary"
+
+
+def read(path: Path, *, sampling: str | None = None) -> BTF:
+    """A MERL BRDF, looked up bin by bin under every light and view of a table of directions.
+
+    Args:
+        path: the file.
+        sampling: "bonn81" (default: 6561 pairs up to 75 degrees) or "bonn151" (22801 pairs).
+
+    Raises:
+        FormatError: other numbers of bins, or not the bytes they need.
+    """
+    values, record = named.assumptions(sampling=(sampling, "bonn81"))
+    if values["sampling"] not in _TABLES:
+        raise ValueError(f"sampling {values['sampling']!r}; expected {' or '.join(_TABLES)}")
+    table = _TABLES[values["sampling"]]()
+    pairs = np.array(list(itertools.product(range(len(table)), repeat=2)))
+    light, view = table[pairs[:, 0]], table[pairs[:, 1]]
+    brdf = lookup(_planes(path), light, view)
+    quantity = np.pi * brdf * light[:, 2:]
+    return named.assembled(
+        path,
+        as_textures(quantity[:, None, None].astype(np.float32)),
+        light=light,
+        view=view,
+        wrap="wrap",
+        provenance={
+            "source": str(path),
+            "format": "merl",
+            "invalid_pairs": int(np.isnan(quantity).any(axis=1).sum()),
+            **record,
+        },
+    )
+
+
+def lookup(
+    planes: NDArray[np.float64], light: NDArray[np.floating], view: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """BRDF values of direction pairs: the bin they fall in, as the publisher's reader does.
+
+    Args:
+        planes: (3, 90, 90, 180) stored values.
+        light, view: (n, 3) unit vectors.
+
+    Returns:
+        (n, 3) f_r; NaN where a channel is invalid.
+    """
+    half, diff = directions.half_difference(light, view)
+    theta_half, _ = directions.to_angles(half)
+    theta_diff, phi_diff = directions.to_angles(diff)
+    # Rounding: an angle on the border of two bins belongs to the upper one.
+    nudge = 1e-9
+    i = np.sqrt(theta_half / (np.pi / 2)) * 90 + nudge
+    j = theta_diff / (np.pi / 2) * 90 + nudge
+    k = (phi_diff % np.pi) / np.pi * 180 + nudge
+    index = tuple(
+        np.clip(bins.astype(int), 0, size - 1) for bins, size in zip((i, j, k), _BINS, strict=True)
+    )
+    found = np.moveaxis(planes[(slice(None), *index)], 0, -1) * _SCALE
+    invalid = ~(found >= 0).all(axis=-1)
+    found[invalid] = np.nan
+    return found
+
+
+def _planes(path: Path) -> NDArray[np.float64]:
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        start = file.read(12)
+    bins = tuple(np.frombuffer(start, "<i4").tolist()) if len(start) == 12 else ()
+    if bins != _BINS:
+        raise FormatError(
+            path, f"bins {bins}; expected {_BINS}", remedy="only the isotropic form is read"
+        )
+    expected = 12 + 3 * 8 * int(np.prod(_BINS))
+    if size != expected:
+        raise FormatError(path, f"{size} bytes; expected {expected}", remedy="copy it again")
+    return np.memmap(path, "<f8", "r", 12, (3, *_BINS))

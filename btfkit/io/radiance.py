@@ -1,0 +1,124 @@
+"""Radiance pictures (RGBE), in each of the eight orientations that their header can say."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit.errors import FormatError
+
+Array = NDArray[np.float32]
+# A side that long, or that many values, is a damaged header.
+_MOST_SIDE, _MOST_VALUES = 1 << 16, 1 << 30
+_RESOLUTION = re.compile(rb"([-+])([XY]) +(\d+) +([-+])([XY]) +(\d+)")
+
+
+def read(name: str, data: bytes, *, orientation: str = "standard") -> Array:
+    """A Radiance picture (RGBE) in any of the eight orientations its resolution line can say.
+
+    Args:
+        name: for messages.
+        data: the bytes of the file.
+        orientation: "standard" follows the resolution line; "btf_extractor" takes the values as
+            rows from the bottom up whatever the line says, as that reader of ATRIUM does.
+
+    Returns:
+        (h, w, 3) linear float32, row 0 on top.
+
+    Raises:
+        FormatError: not a Radiance picture, damaged, or absurdly large.
+    """
+    blank = data.find(b"\n\n")
+    end = data.find(b"\n", blank + 2)
+    match = _RESOLUTION.fullmatch(data[blank + 2 : end].strip()) if 0 <= blank < end else None
+    if data[:2] != b"#?" or match is None:
+        raise FormatError(name, "not a Radiance picture: no resolution line after the header")
+    if b"FORMAT=32-bit_rle_xyze" in data[:blank]:
+        raise FormatError(name, "the Radiance picture holds XYZ; expected RGB")
+    first_sign, first, count, second_sign, second, length = match.groups()
+    scanlines, pixels = int(count), int(length)
+    exposure = _exposure(name, data[:blank])
+    if first == second:
+        raise FormatError(name, f"resolution line {match[0].decode()!r} names one axis twice")
+    check_size(name, scanlines, pixels)
+    rgbe = _scanlines(name, data, end + 1, scanlines, pixels)
+    # Ward: the value of a mantissa m with exponent e is (m + 0.5) 2^(e - 136), black where e = 0.
+    exponent = rgbe[..., 3].astype(np.int32)
+    scale = np.where(exponent > 0, np.ldexp(np.float32(1), exponent - 136), np.float32(0))
+    image = (rgbe[..., :3] + np.float32(0.5)) * scale[..., None] / np.float32(exposure)
+    if orientation == "btf_extractor":
+        return np.ascontiguousarray(image[::-1], np.float32)
+    if orientation != "standard":
+        raise ValueError(f"orientation {orientation!r}; expected standard or btf_extractor")
+    # -Y runs down the rows, +X along the columns; the first axis counts scanlines.
+    if (first_sign == b"-") == (first == b"X"):
+        image = image[::-1]
+    if (second_sign == b"-") == (second == b"X"):
+        image = image[:, ::-1]
+    if first == b"X":
+        image = image.transpose(1, 0, 2)
+    return np.ascontiguousarray(image, np.float32)
+
+
+def _exposure(name: str, header: bytes) -> float:
+    """By what the values were multiplied when they were written: all EXPOSURE lines together."""
+    total = 1.0
+    for line in re.findall(rb"^EXPOSURE=(.*)$", header, re.MULTILINE):
+        try:
+            total *= float(line)
+        except ValueError:
+            total = 0.0
+    if not 1e-20 < total < 1e20:
+        raise FormatError(name, "the EXPOSURE of the Radiance picture is no positive number")
+    return total
+
+
+def _scanlines(name: str, data: bytes, at: int, count: int, length: int) -> NDArray[np.uint8]:
+    """(count, length, 4) RGBE of flat or new-style run-length encoded scanlines."""
+    flat = 4 * count * length
+    if data[at : at + 2] != b"\x02\x02" or not 8 <= length < 32768:
+        if len(data) - at < flat:
+            raise FormatError(
+                name,
+                f"{len(data) - at} bytes of flat pixels; expected {flat}",
+                remedy="copy it again, or write it anew if its run-length code is that of 1991",
+            )
+        return np.frombuffer(data, np.uint8, flat, at).reshape(count, length, 4)
+    if len(data) - at < 4 * count:
+        raise FormatError(name, f"cut short: {len(data) - at} bytes for {count} scanlines")
+    out = np.empty((count, 4, length), np.uint8)
+    for line in range(count):
+        if data[at : at + 2] != b"\x02\x02" or data[at + 2] << 8 | data[at + 3] != length:
+            raise FormatError(name, f"scanline {line} does not start with its length {length}")
+        at += 4
+        for channel in range(4):
+            at = _runs(name, data, at, out[line, channel])
+    return out.transpose(0, 2, 1)
+
+
+def _runs(name: str, data: bytes, at: int, out: NDArray[np.uint8]) -> int:
+    """Fill one channel of a scanline from runs; returns where the next begins."""
+    filled = 0
+    while filled < len(out):
+        if at >= len(data):
+            raise FormatError(name, "the run-length code is cut short")
+        code = data[at]
+        size = code - 128 if code > 128 else code
+        needed = 2 if code > 128 else 1 + size
+        if size == 0 or filled + size > len(out) or at + needed > len(data):
+            raise FormatError(name, f"the run-length code is damaged at byte {at}")
+        if code > 128:
+            out[filled : filled + size] = data[at + 1]
+        else:
+            out[filled : filled + size] = np.frombuffer(data, np.uint8, size, at + 1)
+        filled += size
+        at += needed
+    return at
+
+
+def check_size(name: str, h: int, w: int, channels: int = 3) -> None:
+    """Refuse a size that only a damaged or hostile header declares."""
+    if not (0 < h <= _MOST_SIDE and 0 < w <= _MOST_SIDE) or h * w * channels > _MOST_VALUES:
+        raise FormatError(name, f"declares {h} x {w} x {channels} values")
