@@ -52,7 +52,7 @@ class Settings:
         pool_mb: memory for textures.
     """
 
-    omega: float = 5.0
+    omega: float = 2.0
     latents: int = evaluated.LATENTS
     encoder: bool = True
     parallax: bool = False
@@ -67,7 +67,7 @@ class Settings:
     style: float = 0.0
     frequency: float = 0.0
     frontal: float = 0.5
-    crop: int = 160
+    crop: int = 96
     precision: str = "float16"
     pool_mb: int = DEFAULT_BYTES >> 20
 

@@ -1,0 +1,221 @@
+"""Propagation: a fitted NeuBTF carried onto another guidance image.
+
+The encoder reads the image and gives a neural texture of its size; with the renderer as it was
+fitted, that is a material of its own. Nothing is trained.
+
+Source: Rodriguez-Pardo et al., "NeuBTF: Neural fields for BTF encoding and transfer",
+Computers & Graphics 114, 2023, sections 3.1 and 6.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from btfkit.btf import Wrap
+from btfkit.errors import FitError, FormatError
+from btfkit.files import refuse_existing
+from btfkit.fitting import augment
+from btfkit.fitting.neubtf import encode
+from btfkit.fitting.unet import Encoder
+from btfkit.io import images
+from btfkit.materials import file
+from btfkit.materials.neubtf import NeuBTF
+
+Array = NDArray[np.float32]
+# A guidance of more texels needs more memory for its encoder than most machines have.
+_MOST_TEXELS = 1 << 25
+
+
+def propagate(
+    guidance: str | os.PathLike[str] | Array,
+    model: str | os.PathLike[str],
+    *,
+    scale: float = 1.0,
+    tileable: bool = False,
+    wrap: Wrap | None = None,
+    out: str | os.PathLike[str] | None = None,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> NeuBTF:
+    """The NeuBTF of `model` on another structure.
+
+    Args:
+        guidance: an image file, or (h, w, c) linear values in 0..1; grey is repeated, alpha
+            left out with a warning.
+        model: a NeuBTF file with its encoder.
+        scale: the guidance is resized by this first; within the scales of the training (half to
+            one, unless it was set otherwise) the material scales with it.
+        tileable: make the guidance tile first.
+        wrap: whether the guidance tiles; None takes "wrap" where it was made to, else "clamp".
+        out: file to write, without the encoder; None writes nothing.
+        force: whether an existing `out` is replaced.
+        progress: called with (stages done, stages).
+
+    Raises:
+        FitError: the model has no encoder.
+        FormatError: the guidance or the model cannot be read.
+        ValueError: a guidance with no size, too large, or with channels that no image has.
+    """
+    final = None if out is None else refuse_existing(out, force=force)
+    material, encoder, mean, deviation = _fitted(model)
+    image, name = _image(guidance)
+    if progress:
+        progress(1, 4)
+    if tileable:
+        from btfkit.synthesis import make_tileable
+
+        image = make_tileable(image)
+    chosen: Wrap = wrap or ("wrap" if tileable else "clamp")
+    prepared = prepare(image, scale=scale, wrap=chosen == "wrap")
+    if progress:
+        progress(2, 4)
+    with torch.no_grad():
+        encoded = encode(encoder, prepared, wrap=chosen == "wrap")
+        texture = encoded[0].permute(1, 2, 0) * deviation + mean
+    h, w = texture.shape[:2]
+    weights = {
+        **material.weights,
+        "texture": texture.numpy().astype(material.weights["texture"].dtype),
+    }
+    if progress:
+        progress(3, 4)
+    texel_mm = material.header.texel_mm
+    header = replace(
+        material.header,
+        grid=(h, w),
+        wrap=chosen,
+        texel_mm=None if texel_mm is None else texel_mm / scale,
+        provenance={
+            **material.header.provenance,
+            "propagated": {
+                "guidance": name,
+                "model": os.fspath(model),
+                "scale": scale,
+                "tileable": tileable,
+                "transfer": "sRGB encoded, standardised per channel, as in training",
+            },
+        },
+    )
+    carried = NeuBTF(replace(material.spec, size=(h, w)), weights, header)
+    if final is not None:
+        file.save(carried, final, force=force)
+    if progress:
+        progress(4, 4)
+    return carried
+
+
+def has_encoder(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a NeuBTF that can be propagated."""
+    try:
+        described = file.header_of(path)
+    except (FormatError, OSError):
+        return False
+    return described["model"] == "neubtf" and any(
+        name.startswith(file.TRAINING + "encoder.") for name in described["shapes"]
+    )
+
+
+def prepare(image: Array, *, scale: float = 1.0, wrap: bool = False) -> torch.Tensor:
+    """(1, 3, h, w) sRGB encoded guidance of a linear (h, w, c) image, resized by `scale`.
+
+    Raises:
+        ValueError: no size, too large, or channels that no image has.
+    """
+    if image.ndim != 3 or min(image.shape[:2]) < 1:
+        raise ValueError(f"guidance has shape {image.shape}; expected (h, w, c)")
+    h, w, c = image.shape
+    if c in (2, 4):
+        warnings.warn(
+            f"the guidance has {c} channels; the last is taken for alpha and left out", stacklevel=3
+        )
+        image = image[..., : c - 1]
+    elif c not in (1, 3):
+        raise ValueError(f"guidance has {c} channels; expected 1 (grey) or 3 (RGB)")
+    if not 0 < scale < 1e3:
+        raise ValueError(f"scale = {scale}; expected a positive factor")
+    size = (max(1, round(h * scale)), max(1, round(w * scale)))
+    if size[0] * size[1] > _MOST_TEXELS:
+        raise ValueError(f"guidance of {size[0]} x {size[1]}; at most {_MOST_TEXELS} texels")
+    bad = ~np.isfinite(image)
+    if bad.any():
+        warnings.warn(
+            f"{bad.any(axis=-1).sum()} guidance texels are not finite: taken as mean", stacklevel=3
+        )
+        image = np.where(
+            bad, np.nanmean(np.where(bad, np.nan, image)) if not bad.all() else 0, image
+        )
+    tensor = torch.from_numpy(np.ascontiguousarray(image, np.float32)).permute(2, 0, 1)[None]
+    return augment.resized(augment.encoded(augment.three_channels(tensor)), size, wrap=wrap)
+
+
+def consistency(guidance: Array, model: str | os.PathLike[str], *, scale: float) -> float:
+    """How alike R(A(G)) shrunk and R(A(G shrunk)) are: PSNR in decibel over nine pairs.
+
+    Args:
+        guidance: (h, w, c) linear image.
+        model: a NeuBTF file with its encoder.
+        scale: below 1.
+    """
+    from btfkit import directions, metrics
+    from btfkit.materials.evaluation import texel_centres
+
+    fine = propagate(guidance, model)
+    coarse = propagate(guidance, model, scale=scale)
+    table = directions.bonn81()[[0, 20, 40]]
+    total = 0.0
+    for light in table:
+        for view in table:
+            answers = [
+                m.evaluate(texel_centres(*m.header.grid), light, view).reflectance
+                for m in (fine, coarse)
+            ]
+            shrunk = augment.resized(
+                torch.from_numpy(answers[0]).permute(2, 0, 1)[None], coarse.header.grid, wrap=False
+            )[0].permute(1, 2, 0)
+            total += float(np.square(shrunk.numpy() - answers[1]).mean())
+    return metrics.psnr(total / len(table) ** 2)
+
+
+def _fitted(
+    path: str | os.PathLike[str],
+) -> tuple[NeuBTF, Encoder, torch.Tensor, torch.Tensor]:
+    """A NeuBTF, its encoder, and the mean and deviation of its latents."""
+    material = file.load(path)
+    if not isinstance(material, NeuBTF):
+        raise FitError(f"{os.fspath(path)} is a {material.model}; only a NeuBTF can be propagated")
+    arrays = file.training_arrays(path)
+    weights = {
+        name.removeprefix("encoder."): torch.from_numpy(value)
+        for name, value in arrays.items()
+        if name.startswith("encoder.")
+    }
+    if not weights or "mean" not in arrays or "deviation" not in arrays:
+        raise FitError(
+            f"{os.fspath(path)} has no encoder (a propagated NeuBTF has none)",
+            remedy="name the model that was fitted",
+        )
+    encoder = Encoder(material.spec.latents, torch.Generator())
+    try:
+        encoder.load_state_dict(weights)
+    except RuntimeError as error:
+        raise FormatError(path, f"the encoder does not fit this version ({error})") from error
+    mean, deviation = (torch.from_numpy(arrays[name]) for name in ("mean", "deviation"))
+    return material, encoder.eval(), mean, deviation
+
+
+def _image(guidance: str | os.PathLike[str] | Array) -> tuple[Array, Any]:
+    if isinstance(guidance, np.ndarray):
+        return guidance.astype(np.float32), "an array"
+    path = Path(guidance)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such image")
+    return images.read(path.name, path.read_bytes(), transfer="srgb"), str(path)
