@@ -20,6 +20,7 @@ from btfkit.errors import FormatError
 FORMATS: dict[str, str] = {
     "zarr": "btfkit.io.store",
     "axf": "btfkit.io.axf",
+    "manifest": "btfkit.io.manifest",
     "spectral": "btfkit.io.spectral",
     "ubo2003": "btfkit.io.ubo2003",
     "utia": "btfkit.io.utia",

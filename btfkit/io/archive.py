@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import posixpath
 import threading
 import zipfile
@@ -37,14 +38,18 @@ class Archive:
         self.path = path
         self._local = threading.local()
         self._zip = not path.is_dir()
-        self._by_last: dict[str, list[str]] = {}
-        self._infos: dict[str, zipfile.ZipInfo] = {}
+        self._infos = self._checked() if self._zip else {}
+
+    @functools.cached_property
+    def names(self) -> list[str]:
+        """All members, sorted."""
         if self._zip:
-            self._infos = self._checked()
-            self.names = sorted(self._infos)
-        else:
-            found = (p for p in path.rglob("*") if p.is_file())
-            self.names = sorted(p.relative_to(path).as_posix() for p in found if _counts(p))
+            return sorted(self._infos)
+        found = (p for p in self.path.rglob("*") if p.is_file())
+        return sorted(p.relative_to(self.path).as_posix() for p in found if _counts(p))
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._infos if self._zip else (self.path / name).is_file()
 
     def read(self, name: str) -> bytes:
         """The bytes of a member. May be called from several threads.
@@ -127,18 +132,23 @@ class Archive:
             FormatError: several members have that last part.
         """
         plain = name.replace("\\", "/")
-        if not self._by_last:
-            for member in self.names:
-                self._by_last.setdefault(PurePosixPath(member).name.lower(), []).append(member)
-        relative = posixpath.normpath(posixpath.join(base, plain))
-        found = self._by_last.get(PurePosixPath(plain).name.lower(), [])
-        if relative in found:
+        relative = inside(plain, base)
+        if relative is not None and relative in self:
             return relative
+        found = self._by_last.get(PurePosixPath(plain).name.lower(), [])
         if len(found) > 1:
             raise FormatError(
                 self.path, f"{name!r} may be any of {', '.join(found[:3])}", remedy="rename them"
             )
         return found[0] if found else None
+
+    @functools.cached_property
+    def _by_last(self) -> dict[str, list[str]]:
+        """Members by the last part of their names."""
+        members: dict[str, list[str]] = {}
+        for member in self.names:
+            members.setdefault(PurePosixPath(member).name.lower(), []).append(member)
+        return members
 
     def _checked(self) -> dict[str, zipfile.ZipInfo]:
         infos: dict[str, zipfile.ZipInfo] = {}
@@ -186,6 +196,14 @@ def names_of(path: Path) -> list[str]:
     except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError):
         return []
     return []
+
+
+def inside(name: str, base: str = "") -> str | None:
+    """`name`, relative to `base`, as a member's name; None where it leaves the archive."""
+    plain = posixpath.join(base, name.replace("\\", "/"))
+    relative = posixpath.normpath(plain)
+    leaves = relative.startswith(("/", "../")) or relative in ("..", ".") or "\0" in relative
+    return None if leaves or ":" in relative.split("/")[0] else relative
 
 
 def folder_with(names: list[str], *required: str) -> str | None:

@@ -115,7 +115,7 @@ def _rows(holder: Archive, name: str, n: int) -> NDArray[np.float64]:
 
 def _mask(holder: Archive, name: str, size: tuple[int, ...]) -> NDArray[np.bool_] | None:
     """(1, h, w) bool; None without a mask."""
-    if name not in holder.names:
+    if name not in holder:
         return None
     mask = images.read(name, holder.read(name), transfer="linear").max(axis=2) > 0.5
     if mask.shape != size:

@@ -137,7 +137,7 @@ def _positions(holder: Archive, name: str, n: int) -> Array:
 
 
 def _power(holder: Archive, name: str) -> Array | None:
-    if name not in holder.names:
+    if name not in holder:
         return None
     power = holder.table(name, 3)
     if len(power) != 1 or (power <= 0).any():
