@@ -6,6 +6,7 @@ import importlib
 from typing import Any
 
 MODELS: dict[str, str] = {
+    "neubtf": "btfkit.materials.neubtf:NeuBTF",
     "neumip": "btfkit.materials.neumip:NeuMIP",
     "neumip-paper": "btfkit.materials.neumip:NeuMIPPaper",
 }
