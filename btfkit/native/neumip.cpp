@@ -8,6 +8,7 @@
 #include <chrono>
 #include <cmath>
 #include <cstdint>
+#include <cstdlib>
 #include <cstring>
 #include <exception>
 #include <functional>
@@ -18,6 +19,9 @@
 
 #if defined(__x86_64__)
 #include <immintrin.h>
+#endif
+#if defined(__linux__)
+#include <sys/mman.h>
 #endif
 
 #include "neumip_plan.hpp"
@@ -117,6 +121,31 @@ void spread(int64_t size, int64_t grain, int threads,
     if (failure) std::rethrow_exception(failure);
 }
 
+// Zeros that begin on a huge page: a texel never lies across two cache lines, and random texels
+// of a large texture do not each need a page walk.
+class Zeros {
+  public:
+    explicit Zeros(size_t count) {
+        constexpr size_t page = size_t(1) << 21;
+        const size_t bytes = count * sizeof(float), align = bytes < page ? 64 : page;
+        const size_t whole = (bytes + align - 1) / align * align + (bytes == 0) * align;
+        data_.reset(static_cast<float*>(std::aligned_alloc(align, whole)));
+        if (!data_) throw std::bad_alloc();
+#if defined(__linux__)
+        if (align == page) madvise(data_.get(), whole, MADV_HUGEPAGE);
+#endif
+        std::memset(data_.get(), 0, bytes);
+    }
+    float* data() { return data_.get(); }
+    float operator[](size_t i) const { return data_.get()[i]; }
+
+  private:
+    struct Free {
+        void operator()(float* p) const { std::free(p); }
+    };
+    std::unique_ptr<float, Free> data_;
+};
+
 // A model's layout, and the scratch that its training keeps between steps.
 class Model {
   public:
@@ -155,6 +184,9 @@ class Model {
         check(p);
         p.decoder.start = offset ? p.offset_mlp.size() : 0;
     }
+
+    Model(const Model&) = delete;
+    Model& operator=(const Model&) = delete;
 
     int64_t weights() const { return int64_t(plan_.weights()); }
     int64_t texels() const { return plan_.texels(); }
@@ -286,13 +318,14 @@ class Model {
     void grow(int threads) {
         while (int(weights_.size()) < threads) {
             weights_.emplace_back(plan_.weights(), 0.f);
-            texels_.emplace_back(size_t(texels()) * kChannels, 0.f);
+            texels_.emplace_back(size_t(texels()) * kChannels);
             touched_.emplace_back(size_t(texels() + 1) / 2, 0);
         }
     }
 
     Plan plan_;
-    std::vector<std::vector<float>> weights_, texels_;
+    std::vector<std::vector<float>> weights_;
+    std::vector<Zeros> texels_;
     std::vector<std::vector<uint8_t>> touched_;
 };
 

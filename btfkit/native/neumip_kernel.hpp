@@ -161,6 +161,41 @@ FN float sum_of(F v) {
 
 // ---------------------------------------------------------------- layers
 
+// Bilinear lookups of up to a tile of queries in textures of one flat array of texels.
+struct Lookup {
+    alignas(64) int32_t query[kTile];
+    alignas(64) int32_t at[4][kTile];  // texels: row 0 col 0, row 0 col 1, row 1 col 0, row 1 col 1
+    alignas(64) float fx[kTile], fy[kTile], weight[kTile], w[kTile], h[kTile];
+    int first = 0, count = 0;  // of the tile's queries
+};
+
+// Texels that a later lookup will want, asked for a few at a time while layers are multiplied.
+struct Feed {
+    struct Wish {
+        const Lookup* list;
+        const float* base;
+    };
+    Wish wishes[4 * kMaxBanks + 4];
+    int wanted = 0, wish = 0, at = 0;
+
+    void reset() { wanted = wish = at = 0; }
+    void add(const Lookup& list, const float* base) { wishes[wanted++] = {&list, base}; }
+    MEMBER void some(int queries) {
+        while (wish < wanted && queries > 0) {
+            const Wish& w = wishes[wish];
+            const int stop = std::min(w.list->count, at + queries);
+            queries -= stop - at;
+            for (; at < stop; ++at)
+                for (int c = 0; c < 4; ++c)
+                    __builtin_prefetch(w.base + size_t(w.list->at[c][at]) * kChannels, 0, 2);
+            if (at == w.list->count) {
+                ++wish;
+                at = 0;
+            }
+        }
+    }
+};
+
 enum Mode {
     kPlain, kForwardRelu, kForwardLeaky, kForwardSine, kTrainSine,
     kBackRelu, kBackLeaky, kBackSine
@@ -240,36 +275,39 @@ FN void block(const float* w, const float* bias, const float* x, int in, float* 
 
 // Queries outermost: a column of inputs stays in the nearest cache for all groups of outputs.
 template <int MR, int NR, int MODE>
-FN void strip(const Packed& p, int first, int groups, const float* x, float* y, float* side, int n) {
+FN void strip(const Packed& p, int first, int groups, const float* x, float* y, float* side, int n,
+              Feed* feed) {
     const int in = p.in;
-    for (int at = 0; at < n; at += NR * L)
+    for (int at = 0; at < n; at += NR * L) {
+        if (feed) feed->some(NR * L / 2);
         for (int g = 0; g < groups; ++g) {
             const int o = first + g * MR, to = o * kStride + at;
             block<MR, NR, MODE>(p.weights.data() + o * in, p.bias.data() + o, x + at, in, y + to,
                                 side + to);
         }
+    }
 }
 
 template <int MODE>
 FN void strips(const Packed& p, int m, int first, int groups, const float* x, float* y, float* side,
-               int n) {
+               int n, Feed* feed) {
     constexpr int wide = L == 16 ? 4 : 2;
     switch (m) {
-        case 5: strip<5, wide, MODE>(p, first, groups, x, y, side, n); break;
-        case 4: strip<4, wide, MODE>(p, first, groups, x, y, side, n); break;
-        case 3: strip<3, 4, MODE>(p, first, groups, x, y, side, n); break;
-        case 2: strip<2, 4, MODE>(p, first, groups, x, y, side, n); break;
-        default: strip<1, 8, MODE>(p, first, groups, x, y, side, n); break;
+        case 5: strip<5, wide, MODE>(p, first, groups, x, y, side, n, feed); break;
+        case 4: strip<4, wide, MODE>(p, first, groups, x, y, side, n, feed); break;
+        case 3: strip<3, 4, MODE>(p, first, groups, x, y, side, n, feed); break;
+        case 2: strip<2, 4, MODE>(p, first, groups, x, y, side, n, feed); break;
+        default: strip<1, 8, MODE>(p, first, groups, x, y, side, n, feed); break;
     }
 }
 
 // y = mode(matrix x + bias) for n queries; n is a multiple of 8 vectors.
 template <int MODE>
-DEEP void gemm(const Packed& p, const float* x, float* y, float* side, int n) {
+DEEP void gemm(const Packed& p, const float* x, float* y, float* side, int n, Feed* feed) {
     const int m = Packed::group(p.out), groups = p.out / m, rest = p.out % m;
     if (side == nullptr) side = y;
-    strips<MODE>(p, m, 0, groups, x, y, side, n);
-    if (rest) strips<MODE>(p, rest, groups * m, 1, x, y, side, n);
+    strips<MODE>(p, m, 0, groups, x, y, side, n, feed);
+    if (rest) strips<MODE>(p, rest, groups * m, 1, x, y, side, n, nullptr);
 }
 
 template <int MO, int MI>
@@ -395,22 +433,23 @@ struct Trace {
     }
 };
 
-DEEP void run_forward(const Net& net, Trace& t, bool train, int n) {
+// Queries from..from+n through a network.
+DEEP void run_forward(const Net& net, Trace& t, bool train, int from, int n, Feed* feed) {
     const int layers = net.mlp->layers(), act = net.mlp->activation;
-    for (int l = 0; l < layers; ++l) {
+    for (int l = 0; l < layers && n > 0; ++l) {
         const Packed& p = net.forward[l];
-        const float* x = t.x[l].base;
-        float* y = t.x[l + 1].base;
-        if (l + 1 == layers || act == kLinear) gemm<kPlain>(p, x, y, nullptr, n);
-        else if (act == kRelu) gemm<kForwardRelu>(p, x, y, nullptr, n);
-        else if (act == kLeaky) gemm<kForwardLeaky>(p, x, y, nullptr, n);
-        else if (train) gemm<kTrainSine>(p, x, y, t.cosine[l].base, n);
-        else gemm<kForwardSine>(p, x, y, nullptr, n);
+        const float* x = t.x[l].base + from;
+        float* y = t.x[l + 1].base + from;
+        if (l + 1 == layers || act == kLinear) gemm<kPlain>(p, x, y, nullptr, n, feed);
+        else if (act == kRelu) gemm<kForwardRelu>(p, x, y, nullptr, n, feed);
+        else if (act == kLeaky) gemm<kForwardLeaky>(p, x, y, nullptr, n, feed);
+        else if (train) gemm<kTrainSine>(p, x, y, t.cosine[l].base + from, n, feed);
+        else gemm<kForwardSine>(p, x, y, nullptr, n, feed);
     }
 }
 
 // Takes the gradient of the outputs in t.d0; returns that of the features.
-DEEP float* run_backward(Net& net, Trace& t, int n) {
+DEEP float* run_backward(Net& net, Trace& t, int n, Feed* feed) {
     const int layers = net.mlp->layers(), act = net.mlp->activation;
     size_t at = net.mlp->size();
     float *dy = t.d0.base, *dx = t.d1.base;
@@ -419,10 +458,10 @@ DEEP float* run_backward(Net& net, Trace& t, int n) {
         at -= size_t(in + 1) * out;
         outer(dy, t.x[l].base, out, in + 1, n, net.gradient.data() + at);
         const Packed& p = net.backward[l];
-        if (l == 0 || act == kLinear) gemm<kPlain>(p, dy, dx, nullptr, n);
-        else if (act == kRelu) gemm<kBackRelu>(p, dy, dx, t.x[l].base, n);
-        else if (act == kLeaky) gemm<kBackLeaky>(p, dy, dx, t.x[l].base, n);
-        else gemm<kBackSine>(p, dy, dx, t.cosine[l - 1].base, n);
+        if (l == 0 || act == kLinear) gemm<kPlain>(p, dy, dx, nullptr, n, feed);
+        else if (act == kRelu) gemm<kBackRelu>(p, dy, dx, t.x[l].base, n, feed);
+        else if (act == kLeaky) gemm<kBackLeaky>(p, dy, dx, t.x[l].base, n, feed);
+        else gemm<kBackSine>(p, dy, dx, t.cosine[l - 1].base, n, feed);
         std::swap(dy, dx);
     }
     return dy;

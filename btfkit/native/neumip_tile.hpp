@@ -2,14 +2,6 @@
 
 // ---------------------------------------------------------------- texture lookups
 
-// Bilinear lookups of up to a tile of queries in textures of one flat array of texels.
-struct Lookup {
-    alignas(64) int32_t query[kTile];
-    alignas(64) int32_t at[4][kTile];  // texels: row 0 col 0, row 0 col 1, row 1 col 0, row 1 col 1
-    alignas(64) float fx[kTile], fy[kTile], weight[kTile], w[kTile], h[kTile];
-    int count = 0;
-};
-
 // Fractions and texels from u, v in tiles and per-query texture sizes (floats) and starts.
 FN void corners(Lookup& k, int n, F u, F v, F w, F h, I start, bool wrap) {
     F x, y;
@@ -52,8 +44,8 @@ FN void corners(Lookup& k, int n, F u, F v, F w, F h, I start, bool wrap) {
     *(I*)(k.at[3] + n) = rb + cb;
 }
 
-DEEP void look_up_one(Lookup& k, const Texture& t, const float* u, const float* v, int n, bool wrap) {
-    for (int i = 0; i < kTile; ++i) k.query[i] = i;
+DEEP void look_up_one(Lookup& k, const Texture& t, const float* u, const float* v, int first, int n,
+                      bool wrap) {
     const F w = all(float(t.w)), h = all(float(t.h)), one = all(1.f);
     for (int i = 0; i < n; i += L) {
         corners(k, i, load(u + i), load(v + i), w, h, I{} + int32_t(t.start), wrap);
@@ -61,6 +53,8 @@ DEEP void look_up_one(Lookup& k, const Texture& t, const float* u, const float* 
         store(k.w + i, w);
         store(k.h + i, h);
     }
+    for (int i = 0; i < n; ++i) k.query[i] = first + i;
+    k.first = first;
     k.count = n;
 }
 
@@ -71,14 +65,15 @@ struct Levels {
 
 // The two levels of a bank for every query; the second list holds only those between levels.
 DEEP void look_up_levels(Lookup& a, Lookup& b, const Plan& plan, const Bank& bank,
-                         const Levels& levels, const float* u, const float* v, int n, int valid) {
+                         const Levels& levels, const float* u, const float* v, int first, int n,
+                         int valid) {
     alignas(64) float w0[kTile], h0[kTile], w1[kTile], h1[kTile], f1[kTile], u1[kTile], v1[kTile];
     alignas(64) int32_t s0[kTile], s1[kTile];
     int second = 0;
     const float top = float(bank.count - 1);
     const Texture* texture = plan.textures.data() + bank.first;
     for (int i = 0; i < n; ++i) {
-        float l = levels.level[i] - bank.shift;
+        float l = levels.level[first + i] - bank.shift;
         l = l > 0.f ? l : 0.f;
         l = l < top ? l : top;
         const int at = int(l);
@@ -88,7 +83,7 @@ DEEP void look_up_levels(Lookup& a, Lookup& b, const Plan& plan, const Bank& ban
         h0[i] = float(t0.h);
         s0[i] = int32_t(t0.start);
         a.weight[i] = 1.f - f;
-        a.query[i] = i;
+        a.query[i] = first + i;
         const Texture& t1 = texture[at + (f > 0.f)];
         w1[second] = float(t1.w);
         h1[second] = float(t1.h);
@@ -96,8 +91,8 @@ DEEP void look_up_levels(Lookup& a, Lookup& b, const Plan& plan, const Bank& ban
         f1[second] = f;
         u1[second] = u[i];
         v1[second] = v[i];
-        b.query[second] = i;
-        second += f > 0.f && i < valid;
+        b.query[second] = first + i;
+        second += f > 0.f && first + i < valid;
     }
     for (int i = second; i < (second + L - 1) / L * L; ++i) {
         w1[i] = h1[i] = 1.f;
@@ -114,6 +109,7 @@ DEEP void look_up_levels(Lookup& a, Lookup& b, const Plan& plan, const Bank& ban
         }
     };
     finish(a, n, u, v, w0, h0, s0);
+    a.first = first;
     a.count = n;
     finish(b, second, u1, v1, w1, h1, s1);
     std::memcpy(b.weight, f1, sizeof(float) * second);
@@ -123,7 +119,7 @@ DEEP void look_up_levels(Lookup& a, Lookup& b, const Plan& plan, const Bank& ban
 // Features of one bank for a tile: values, and in training their slopes along u and v.
 struct Features {
     alignas(64) float value[kTile][kChannels], du[kTile][kChannels], dv[kTile][kChannels];
-    Lookup list[2];
+    Lookup list[2][2];  // first and second half of the tile; finer and coarser level
 };
 
 template <bool TRAIN, bool FIRST>
@@ -131,7 +127,7 @@ DEEP void fetch(const Lookup& k, const float* texels, Features& out) {
     for (int i = 0; i < k.count; ++i) {
         const int ahead = i + kAhead < k.count ? i + kAhead : i;
         for (int c = 0; c < 4; ++c) __builtin_prefetch(texels + size_t(k.at[c][ahead]) * kChannels);
-        const int q = FIRST ? i : k.query[i];
+        const int q = FIRST ? k.first + i : k.query[i];
         const float fx = k.fx[i], fy = k.fy[i], w = k.weight[i];
         const V8 t00 = get8(texels + size_t(k.at[0][i]) * kChannels);
         const V8 t01 = get8(texels + size_t(k.at[1][i]) * kChannels);
@@ -176,7 +172,7 @@ DEEP void from_rows(const float* rows, float (*to)[kChannels], int channels, int
 
 DEEP void scatter(const Lookup& k, const float (*d)[kChannels], int valid, Gradient& g) {
     float* out = g.texels;
-    const int count = k.count < valid ? k.count : valid;
+    const int count = std::min(k.count, valid - k.first);
     for (int i = 0; i < count; ++i) {
         const int ahead = i + kAhead < count ? i + kAhead : i;
         for (int c = 0; c < 4; ++c) __builtin_prefetch(out + size_t(k.at[c][ahead]) * kChannels, 1);
@@ -205,6 +201,11 @@ struct Tile {
     alignas(64) float direction[kDirections][kTile];
     alignas(64) float position[2][kTile];
     alignas(64) float gather[kTile][kChannels];
+    Lookup offset_list[2];  // of this tile and of the next
+    int64_t offset_at[2] = {-1, -1};
+    int ahead = 0, now = 0;
+    bool fetched = false;
+    Feed feed;
     enum { kU, kV, kHu, kHv, kLu, kLv, kDepth, kMoveU, kMoveV, kInRows };
 
     NEUMIP_TARGET Tile(const Plan& p, const float* weights, const float* t, bool train)
@@ -303,50 +304,100 @@ struct Tile {
             std::memcpy(t.x[0][m.features() + int(k)], direction[m.directions[k]], sizeof(float) * n);
     }
 
-    template <bool TRAIN>
-    DEEP void find_depth(Tile& s, int n) {
-        if (!s.plan.offset) return;
-        const Bank& bank = s.plan.offset_bank;
-        Features& f = s.offset_features;
-        look_up_one(f.list[0], s.plan.textures[bank.first], s.in[kU], s.in[kV], n, s.plan.wrap);
-        fetch<false, true>(f.list[0], s.texels, f);
-        to_rows(f.value, s.offset_trace.x[0].base, bank.channels, n);
-        s.put_directions(s.plan.offset_mlp, s.offset_trace, n);
-        run_forward(s.offset, s.offset_trace, TRAIN, n);
-        std::memcpy(s.in[kDepth], s.offset_trace.x.back().base, sizeof(float) * n);
+    // The tile's queries in two runs: while one is multiplied, the other's texels are on their way.
+    static int half_from(int half) { return half * kTile / 2; }
+    static int half_size(int half, int n) {
+        return half ? std::max(n - kTile / 2, 0) : std::min(n, kTile / 2);
+    }
+
+    // Offset lookups of the next tile, whose texels the present one's layers fetch.
+    NEUMIP_TARGET void look_ahead(const Batch& b, int64_t at, int valid) {
+        if (!plan.offset) return;
+        ahead = 1 - ahead;
+        for (int i = 0; i < valid; ++i) {
+            position[0][i] = b.uv[2 * (at + i)];
+            position[1][i] = b.uv[2 * (at + i) + 1];
+        }
+        const int n = padded(valid);
+        for (int i = valid; i < n; ++i) {
+            position[0][i] = position[0][valid - 1];
+            position[1][i] = position[1][valid - 1];
+        }
+        look_up_one(offset_list[ahead], plan.textures[plan.offset_bank.first], position[0],
+                    position[1], 0, n, plan.wrap);
+        offset_at[ahead] = at;
     }
 
     template <bool TRAIN>
-    DEEP void find_features(Tile& s, bool lights, int valid, int n) {
-        int row = 0;
+    DEEP void find_features(Tile& s, const Batch& b, int64_t at, int valid, int n) {
         const Plan& plan = s.plan;
-        for (size_t b = 0; b < plan.banks.size(); row += plan.banks[b++].channels) {
-            const Bank& bank = plan.banks[b];
-            if ((bank.light != 0) != lights && !TRAIN) continue;
-            const float *u = s.in[kU], *v = s.in[kV];
+        if (plan.offset) {
+            if (s.offset_at[s.ahead] != at) s.look_ahead(b, at, valid);
+            s.now = s.ahead;
+            fetch<false, true>(s.offset_list[s.now], s.texels, s.offset_features);
+            to_rows(s.offset_features.value, s.offset_trace.x[0].base, plan.offset_bank.channels, n);
+            s.put_directions(plan.offset_mlp, s.offset_trace, n);
+        }
+        s.feed.reset();
+        for (int half = 0; half < 2; ++half) {
+            const int from = half_from(half), size = half_size(half, n);
+            if (plan.offset) {
+                run_forward(s.offset, s.offset_trace, TRAIN, from, size, &s.feed);
+                std::memcpy(s.in[kDepth] + from, s.offset_trace.x.back().base + from,
+                            sizeof(float) * size);
+            }
+            look_up_features(s, from, size, half, valid, false);
+            if (half == 0) s.wish(half, s.texels);
+        }
+    }
+
+    DEEP void look_up_features(Tile& s, int from, int size, int half, int valid, bool lights) {
+        const Plan& plan = s.plan;
+        for (size_t k = 0; k < plan.banks.size(); ++k) {
+            const Bank& bank = plan.banks[k];
+            Lookup(&list)[2] = s.features[k].list[half];
+            if ((bank.light != 0) != lights) continue;
+            list[1].count = 0;
+            const float *u = s.in[kU] + from, *v = s.in[kV] + from;
             if (plan.offset && (bank.view != 0 || bank.light != 0)) {
-                for (int i = 0; i < n; i += L) {
+                for (int i = from; i < from + size; i += L) {
                     const F r = load(s.in[kDepth] + i);
                     F hu = load(s.in[kHu] + i) * bank.view, hv = load(s.in[kHv] + i) * bank.view;
                     if (bank.light != 0) {
                         hu -= load(s.in[kLu] + i) * bank.light;
                         hv -= load(s.in[kLv] + i) * bank.light;
                     }
-                    store(s.position[0] + i, load(u + i) + r * hu);
-                    store(s.position[1] + i, load(v + i) + r * hv);
+                    store(s.position[0] + i, load(s.in[kU] + i) + r * hu);
+                    store(s.position[1] + i, load(s.in[kV] + i) + r * hv);
                 }
-                u = s.position[0];
-                v = s.position[1];
+                u = s.position[0] + from;
+                v = s.position[1] + from;
             }
-            Features& f = s.features[b];
-            f.list[1].count = 0;
             if (s.levels.finest || bank.count == 1)
-                look_up_one(f.list[0], plan.textures[bank.first], u, v, n, plan.wrap);
+                look_up_one(list[0], plan.textures[bank.first], u, v, from, size, plan.wrap);
             else
-                look_up_levels(f.list[0], f.list[1], plan, bank, s.levels, u, v, n, valid);
-            fetch<TRAIN, true>(f.list[0], s.texels, f);
-            if (f.list[1].count) fetch<TRAIN, false>(f.list[1], s.texels, f);
-            to_rows(f.value, s.decoder_trace.x[0][row], bank.channels, n);
+                look_up_levels(list[0], list[1], plan, bank, s.levels, u, v, from, size, valid);
+        }
+    }
+
+    // Adds the lookups of a half to what the layers fetch meanwhile.
+    void wish(int half, const float* base) {
+        for (size_t k = 0; k < plan.banks.size(); ++k)
+            for (const Lookup& list : features[k].list[half])
+                if (list.count) feed.add(list, base);
+    }
+
+    template <bool TRAIN>
+    DEEP void fetch_features(Tile& s, int half, int n, bool lights) {
+        int row = 0;
+        const int from = half_from(half), size = half_size(half, n);
+        for (size_t k = 0; k < s.plan.banks.size(); row += s.plan.banks[k++].channels) {
+            const Bank& bank = s.plan.banks[k];
+            if (!TRAIN && (bank.light != 0) != lights) continue;
+            Features& f = s.features[k];
+            fetch<TRAIN, true>(f.list[half][0], s.texels, f);
+            if (f.list[half][1].count) fetch<TRAIN, false>(f.list[half][1], s.texels, f);
+            to_rows(f.value + from, s.decoder_trace.x[0][row] + from, bank.channels, size);
         }
     }
 
@@ -364,17 +415,29 @@ struct Tile {
         const int n = padded(valid);
         set_position(b.uv + 2 * at, b.footprint ? b.footprint + at : nullptr, valid, n);
         set_view(b.view + 3 * at, valid, n);
-        find_depth<false>(*this, n);
-        find_features<false>(*this, false, valid, n);
+        find_features<false>(*this, b, at, valid, n);
+        fetched = false;
     }
 
-    // Writes (valid, channels) reflectance; stage_one has run for these queries.
+    // Writes (valid, outputs) reflectance; stage_one has run for these queries.
     NEUMIP_TARGET void stage_two(const float* light, bool same, int valid, float* rgb, bool raw) {
         const int n = padded(valid);
         set_light(light, valid, n, same);
-        if (plan.needs_light()) find_features<false>(*this, true, valid, n);
         put_directions(plan.decoder, decoder_trace, n);
-        run_forward(decoder, decoder_trace, false, n);
+        feed.reset();
+        wish(1, texels);
+        for (int half = 0; half < 2; ++half) {
+            const int from = half_from(half), size = half_size(half, n);
+            if (size == 0) break;
+            if (plan.needs_light()) {
+                look_up_features(*this, from, size, half, valid, true);
+                fetch_features<false>(*this, half, n, true);
+            }
+            if (!fetched) fetch_features<false>(*this, half, n, false);
+            run_forward(decoder, decoder_trace, false, from, size, &feed);
+            if (half == 0 && plan.offset && ahead != now) feed.add(offset_list[ahead], texels);
+        }
+        fetched = true;
         const int outputs = raw ? plan.decoder.widths.back() : plan.channels;
         Rows& z = decoder_trace.x.back();
         if (!raw)
@@ -383,6 +446,15 @@ struct Tile {
                     const F y = smaller(larger(answer(c, i), all(0.f)), all(20.f));
                     store(z[c] + i, exp_of(y) - 1.f);
                 }
+        if (outputs == 3) {
+            const float *r = z[0], *g = z[1], *bl = z[2];
+            for (int i = 0; i < valid; ++i) {
+                rgb[3 * i] = r[i];
+                rgb[3 * i + 1] = g[i];
+                rgb[3 * i + 2] = bl[i];
+            }
+            return;
+        }
         for (int c = 0; c < outputs; ++c) {
             const float* row = z[c];
             for (int i = 0; i < valid; ++i) rgb[size_t(i) * outputs + c] = row[i];
@@ -394,22 +466,24 @@ struct Tile {
                              Gradient& g) {
         const int c = plan.channels;
         double sum = 0;
+        float* target = slopes[0];
+        float* weight = slopes[1];
+        for (int i = 0; i < n; ++i) weight[i] = i < valid ? (b.weight ? b.weight[at + i] : 1.f) : 0.f;
         for (int k = 0; k < c; ++k) {
-            float* target = slopes[0];
-            float* weight = slopes[1];
-            for (int i = 0; i < n; ++i) {
-                const float t = i < valid ? b.target[(at + i) * c + k] : NAN;
-                const bool good = t - t == 0.f;
-                weight[i] = good ? (b.weight ? b.weight[at + i] : 1.f) : 0.f;
-                target[i] = good ? (t > -0.1f ? t : -0.1f) + 1.f : 1.f;
-                g.counted += good;
-            }
+            const float* from = b.target + at * c + k;
+            for (int i = 0; i < valid; ++i) target[i] = from[int64_t(i) * c];
+            for (int i = valid; i < n; ++i) target[i] = NAN;
+            F counted = all(0.f);
             F total = all(0.f);
             Rows& z = decoder_trace.x.back();
             float* d = decoder_trace.d0[k];
             for (int i = 0; i < n; i += L) {
-                const F w = load(weight + i), y = answer(k, i);
-                const F e = y - log_of(load(target + i));
+                const F t = load(target + i), y = answer(k, i);
+                const I good = t - t == all(0.f);
+                const F w = select(good, load(weight + i), all(0.f));
+                counted += select(good, all(1.f), all(0.f));
+                const F safe = larger(select(good, t, all(0.f)), all(-0.1f));
+                const F e = y - log_of(safe + 1.f);
                 const F size = e < all(0.f) ? -e : e;
                 total += w * (loss == kSquare ? e * e : size);
                 const F sign = e > all(0.f) ? all(1.f) : (e < all(0.f) ? all(-1.f) : all(0.f));
@@ -423,36 +497,54 @@ struct Tile {
                 store(d + i, dy);
             }
             sum += sum_of(total);
+            g.counted += int64_t(sum_of(counted));
         }
         g.loss += sum * scale;
     }
 
-    NEUMIP_TARGET void train(const Batch& b, int64_t at, int valid, int loss, float scale,
-                             Gradient& g) {
+    NEUMIP_TARGET void train(const Batch& b, int64_t at, int valid, int next, int loss,
+                             float scale, Gradient& g) {
         const int n = padded(valid);
         set_position(b.uv + 2 * at, b.footprint ? b.footprint + at : nullptr, valid, n);
         set_view(b.view + 3 * at, valid, n);
         set_light(b.light + 3 * at, valid, n, false);
-        find_depth<true>(*this, n);
-        find_features<true>(*this, false, valid, n);
+        find_features<true>(*this, b, at, valid, n);
+        if (plan.needs_light())
+            for (int half = 0; half < 2; ++half)
+                look_up_features(*this, half_from(half), half_size(half, n), half, valid, true);
         put_directions(plan.decoder, decoder_trace, n);
-        run_forward(decoder, decoder_trace, true, n);
+        feed.reset();
+        wish(1, texels);
+        for (int half = 0; half < 2; ++half) {
+            fetch_features<true>(*this, half, n, false);
+            run_forward(decoder, decoder_trace, true, half_from(half), half_size(half, n), &feed);
+            if (half == 0) wish(0, g.texels);
+        }
         judge(b, at, valid, n, loss, scale, g);
-        const float* d = run_backward(decoder, decoder_trace, n);
+        wish(1, g.texels);
+        if (plan.offset) feed.add(offset_list[now], g.texels);
+        const float* d = run_backward(decoder, decoder_trace, n, &feed);
         float* depth = plan.offset ? offset_trace.d0.base : nullptr;
         if (depth) std::fill(depth, depth + n, 0.f);
-        for (const Bank& bank : plan.banks) {
-            Features& f = features[&bank - plan.banks.data()];
+        for (size_t k = 0; k < plan.banks.size(); ++k) {
+            const Bank& bank = plan.banks[k];
+            Features& f = features[k];
             from_rows(d, gather, bank.channels, n);
-            scatter(f.list[0], gather, valid, g);
-            scatter(f.list[1], gather, f.list[1].count, g);
+            for (int half = 0; half < 2; ++half) {
+                if (half_size(half, n) == 0) continue;
+                scatter(f.list[half][0], gather, valid, g);
+                if (f.list[half][1].count) scatter(f.list[half][1], gather, kTile * 2, g);
+            }
             if (depth && (bank.view != 0 || bank.light != 0)) slope(bank, f, d, depth, n);
             d += bank.channels * kStride;
         }
         if (!depth) return;
-        d = run_backward(offset, offset_trace, n);
+        feed.reset();
+        if (next > 0) look_ahead(b, at + kTile, next);
+        if (ahead != now) feed.add(offset_list[ahead], texels);
+        d = run_backward(offset, offset_trace, n, &feed);
         from_rows(d, gather, plan.offset_bank.channels, n);
-        scatter(offset_features.list[0], gather, valid, g);
+        scatter(offset_list[now], gather, valid, g);
     }
 
     // Adds to the gradient of the depth what moves this bank's lookup.
@@ -478,6 +570,10 @@ struct Tile {
 
 // ---------------------------------------------------------------- entries of this variant
 
+inline int next_size(int64_t at, int64_t to) {
+    return int(std::max<int64_t>(std::min<int64_t>(kTile, to - at - kTile), 0));
+}
+
 // rgb (lights or 1, size, outputs) for queries [from, to); lights: directions shared by all.
 NEUMIP_TARGET void evaluate(const Plan& plan, const float* weights, const float* texels,
                             const Batch& b, const float* lights, int64_t count, int64_t from,
@@ -487,6 +583,7 @@ NEUMIP_TARGET void evaluate(const Plan& plan, const float* weights, const float*
     for (int64_t at = from; at < to; at += kTile) {
         const int valid = int(std::min<int64_t>(kTile, to - at));
         tile->stage_one(b, at, valid);
+        if (at + kTile < to) tile->look_ahead(b, at + kTile, next_size(at, to));
         if (lights == nullptr) {
             tile->stage_two(b.light + 3 * at, false, valid, rgb + at * outputs, raw);
             continue;
@@ -513,7 +610,7 @@ NEUMIP_TARGET void train(const Plan& plan, const float* weights, const float* te
     auto tile = std::make_unique<Tile>(plan, weights, texels, true);
     const float scale = 1.f / (float(b.size) * float(plan.channels));
     for (int64_t at = from; at < to; at += kTile)
-        tile->train(b, at, int(std::min<int64_t>(kTile, to - at)), loss, scale, g);
+        tile->train(b, at, int(std::min<int64_t>(kTile, to - at)), next_size(at, to), loss, scale, g);
     tile->decoder.unpack(g.weights);
     if (plan.offset) tile->offset.unpack(g.weights);
 }
