@@ -11,6 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
+from btfkit import colour
 from btfkit.btf import BTF, COLOUR
 from btfkit.errors import FormatError
 from btfkit.io import archive as archives
@@ -82,8 +83,11 @@ class Head:
         }
         assumed = {key: value for key, value in defaults.items() if settled[key] is None}
         settled.update(assumed)
-        if settled["cosine"] not in ("in", "out"):
-            raise FormatError(path, f"cosine {settled['cosine']!r}; expected in or out")
+        try:
+            named.cosine_factor(settled["cosine"], np.ones((1, 3)))
+            colour.decode(settled["transfer"], np.zeros(1))
+        except ValueError as error:
+            raise FormatError(path, str(error)) from error
         power = head.get("light_power")
         return cls(
             **settled,

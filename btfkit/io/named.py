@@ -11,6 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
+from btfkit import directions
 from btfkit.btf import BTF, RGB
 from btfkit.errors import FormatError
 from btfkit.io import anglenames, images, radiance
@@ -170,7 +171,7 @@ def cosine_factor(cosine: str, light: np.ndarray[Any, Any]) -> Scale | None:
         return None
     if cosine != "out":
         raise ValueError(f"cosine {cosine!r}; expected in or out")
-    factors = np.maximum(light[:, 2], 0).astype(np.float32)
+    factors = np.maximum(directions.normalize(light)[:, 2], 0).astype(np.float32)
     return lambda index, h, w: factors[index]
 
 
