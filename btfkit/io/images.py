@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import struct
 import tempfile
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from btfkit import colour
 from btfkit.errors import FormatError
-from btfkit.io import radiance
+from btfkit.io import headers, radiance
 from btfkit.io.radiance import check_size
 
 Array = NDArray[np.float32]
@@ -54,7 +53,7 @@ def read(name: str, data: bytes, *, transfer: str) -> Array:
 def _read_codes(name: str, data: bytes, transfer: str) -> Array:
     import cv2
 
-    check_size(name, *size_of(name, data))
+    check_size(name, *headers.size_of(name, data))
     _check_whole(name, data)
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
     try:
@@ -90,23 +89,6 @@ def _check_whole(name: str, data: bytes) -> None:
         if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
             raise FormatError(name, f"chunk {kind!r} of the PNG is damaged", remedy="copy it again")
         at = end + 4
-
-
-def size_of(name: str, data: bytes) -> tuple[int, int]:
-    """(h, w) that the header of a PNG, JPEG, TIFF or BMP declares; nothing is decoded."""
-    from io import BytesIO
-
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(BytesIO(data)) as image:
-            return image.height, image.width
-    except Image.DecompressionBombError as error:
-        raise FormatError(name, f"declares too many pixels ({error})") from error
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, struct.error) as error:
-        raise FormatError(
-            name, f"not a readable image ({error})", remedy="copy it again"
-        ) from error
 
 
 def exr_channels(name: str, data: bytes) -> tuple[str, ...]:
