@@ -133,7 +133,8 @@ def fit(
     if final is not None:
         file.save(material, final, training=run.training, force=force)
         _write_report(report, final)
-        _state_file(final).unlink(missing_ok=True)
+        if not run.interrupted:
+            _state_file(final).unlink(missing_ok=True)
     return report
 
 

@@ -52,7 +52,7 @@ class Settings:
         pool_mb: memory for textures.
     """
 
-    omega: float = 2.0
+    omega: float = 2.5
     latents: int = evaluated.LATENTS
     encoder: bool = True
     parallax: bool = False

@@ -82,7 +82,7 @@ def directions(light: Tensor, view: Tensor, footprint: Tensor | None) -> dict[st
     cos_diff = torch.where(none, 0.0, length / 2)[:, 0]
     level = torch.zeros_like(cos_diff)
     if footprint is not None:
-        level = torch.log2((2 * footprint).clamp(min=1))
+        level = torch.log2(2 * footprint.clamp(0.5, 1e30))
     columns = [*light.T, *view.T, *half.T, cos_diff, level / 8]
     return dict(zip(DIRECTIONS, columns, strict=True))
 

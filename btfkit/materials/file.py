@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
 
 from btfkit.errors import FormatError
 from btfkit.files import whole
@@ -53,7 +53,33 @@ def save(
     for name, value in (training or {}).items():
         arrays[TRAINING + name] = np.ascontiguousarray(value)
     with whole(path, force=force) as partial:
-        save_file(arrays, partial, metadata)
+        partial.write_bytes(_packed(arrays, metadata))
+
+
+def _packed(arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) -> bytes:
+    """Bytes of a safetensors file, in one order: the library's own writer shuffles its metadata."""
+    header: dict[str, Any] = {"__metadata__": dict(sorted(metadata.items()))}
+    parts: list[bytes] = []
+    offset = 0
+    for name in sorted(arrays, key=lambda name: (-arrays[name].itemsize, name)):
+        data = arrays[name].tobytes()
+        header[name] = {
+            "dtype": _DTYPES[arrays[name].dtype.str],
+            "shape": list(arrays[name].shape),
+            "data_offsets": [offset, offset + len(data)],
+        }
+        parts.append(data)
+        offset += len(data)
+    encoded = json.dumps(header, separators=(",", ":")).encode()
+    # The header is padded with spaces, so that the arrays start aligned.
+    encoded += b" " * (-len(encoded) % 8)
+    return struct.pack("<Q", len(encoded)) + encoded + b"".join(parts)
+
+
+_DTYPES = {
+    "<f8": "F64", "<f4": "F32", "<f2": "F16", "<i8": "I64", "<i4": "I32", "<i2": "I16",
+    "|i1": "I8", "|u1": "U8", "|b1": "BOOL",
+}  # fmt: skip
 
 
 def load(path: str | os.PathLike[str]) -> Material:

@@ -42,7 +42,7 @@ class NeuBTFSpec:
     channels: int = 3
     latents: int = LATENTS
     width: int = WIDTH
-    omega: float = 2.0
+    omega: float = 2.5
     parallax: bool = False
 
 

@@ -11,7 +11,10 @@ import importlib
 import os
 from types import ModuleType
 
-KERNELS: tuple[str, ...] = ("neumip",)
+KERNELS: tuple[str, ...] = (
+    "trace",
+    "neumip",
+)
 
 
 def load(name: str) -> ModuleType | None:

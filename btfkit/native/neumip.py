@@ -211,7 +211,7 @@ def _directions(
     cos_diff = np.where(none, 0, length / 2)[:, 0].astype(light.dtype)
     level = np.zeros(len(light), light.dtype)
     if footprint is not None:
-        level = np.log2(np.maximum(2 * footprint, 1))
+        level = np.log2(2 * np.clip(footprint, 0.5, 1e30))
     columns = [*light.T, *view.T, *half.T, cos_diff, level / 8]
     return dict(zip(DIRECTIONS, columns, strict=True))
 

@@ -168,7 +168,7 @@ inline void surface_at(const Relief& r, Place at, Surface& s) {
   }
   s.along = mixed(2 * r.c);
   s.across = mixed(2 * r.c + 1);
-  s.opacity = mixed(2 * r.c + 3);
+  s.opacity = std::min(mixed(2 * r.c + 3), 1.0f);
   // Angles do not average: the tangent is that of the nearest centre.
   const float* nearest = at.a < 0.5f ? (at.b < 0.5f ? m00 : m01) : (at.b < 0.5f ? m10 : m11);
   float angle = nearest[2 * r.c + 2];

@@ -222,7 +222,7 @@ class _Surface(NamedTuple):
         tangent = _unit(flat - normal * _dot(flat, normal)[:, None])
         return _Surface(
             normal, tangent, np.cross(normal, tangent), mixed[:, :c], mixed[:, c : 2 * c],
-            mixed[:, 2 * c], mixed[:, 2 * c + 1], mixed[:, 2 * c + 3],
+            mixed[:, 2 * c], mixed[:, 2 * c + 1], np.minimum(mixed[:, 2 * c + 3], 1),
         )  # fmt: skip
 
     def take(self, rows: NDArray[np.intp]) -> _Surface:
