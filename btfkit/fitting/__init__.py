@@ -9,7 +9,10 @@ TRAINED: dict[str, str] = {
     "neubtf": "btfkit.fitting.neubtf:NeuBTF",
 }
 # Models with a closed form: functions (source, *, settings, progress) -> Material.
-CLOSED_FORM: dict[str, str] = {}
+CLOSED_FORM: dict[str, str] = {
+    "lambert": "btfkit.fitting.lambert:lambert",
+    "interpolation": "btfkit.fitting.interpolation:interpolation",
+}
 MODELS: dict[str, str] = {**CLOSED_FORM, **TRAINED}
 
 

@@ -6,6 +6,8 @@ import importlib
 from typing import Any
 
 MODELS: dict[str, str] = {
+    "lambert": "btfkit.materials.lambert:Lambert",
+    "interpolation": "btfkit.materials.interpolation:Interpolation",
     "neubtf": "btfkit.materials.neubtf:NeuBTF",
     "neumip": "btfkit.materials.neumip:NeuMIP",
     "neumip-paper": "btfkit.materials.neumip:NeuMIPPaper",
