@@ -1,0 +1,224 @@
+"""Shapes in closed form: where a ray meets them, and the frame, uv and curvature there.
+
+Object frame: right-handed, x right, y up, z towards a viewer at `view` 0,0. Every shape carries tiles
+that stand upright on the side that faces this viewer, u to the right and v down.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar, NamedTuple, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating]
+# Roots closer than this to a ray's start are the surface it starts on; shapes are of size 1.
+NEAR = 1e-6
+
+
+class Meeting(NamedTuple):
+    """Where rays meet a shape.
+
+    Attributes:
+        distance: (m,) along the ray in its direction's lengths; inf where it misses.
+        part: (m,) which part of the shape is met (a triangle of a mesh), 0 for one-part shapes.
+    """
+
+    distance: Floats
+    part: NDArray[np.intp]
+
+
+class Surface(NamedTuple):
+    """A shape at points of its surface.
+
+    Attributes:
+        point: (m, 3) object frame. normal: (m, 3) unit, outwards.
+        uv: (m, 2) tiles. du, dv: (m, 3) step of the point a tile in u and in v.
+        bend: (m, 3) second fundamental form xx, xy, yy along unit x = du and y = normal x du,
+            in 1/length, positive convex.
+    """
+
+    point: Floats
+    normal: Floats
+    uv: Floats
+    du: Floats
+    dv: Floats
+    bend: Floats
+
+
+class Shape(ABC):
+    """A surface with tiles on it.
+
+    Attributes:
+        half_height: of a square picture that shows it whole from the front.
+        tile: width of a tile where it is not distorted; curvature counts in it.
+        convex: whether no point of its outside shadows another.
+    """
+
+    half_height: float
+    tile: float
+    convex: ClassVar[bool] = True
+
+    @abstractmethod
+    def meet(self, origin: Floats, direction: Floats, beyond: Floats) -> Meeting:
+        """First meeting of each ray that is farther than `beyond` (m,).
+
+        Args:
+            origin, direction: (m, 3) object frame; directions are of length 1.
+        """
+
+    @abstractmethod
+    def surface(self, origin: Floats, direction: Floats, met: Meeting) -> Surface:
+        """The surface where rays meet it; every distance is finite."""
+
+
+@final
+class Plane(Shape):
+    """The rectangle z = 0 that fills the picture at view 0,0, `repeat` tiles across.
+
+    Args:
+        repeat: tiles across. aspect: tile width / tile height.
+        picture: width / height of the picture.
+    """
+
+    def __init__(self, *, repeat: int = 1, aspect: float = 1.0, picture: float = 1.0) -> None:
+        self.half_height = 1.0
+        self._half = np.array([picture, 1.0])
+        self.tile = 2 * picture / repeat
+        self._tile_height = self.tile / aspect
+
+    def meet(self, origin: Floats, direction: Floats, beyond: Floats) -> Meeting:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = -origin[:, 2] / direction[:, 2]
+            at = origin[:, :2] + distance[:, None] * direction[:, :2]
+            inside = (np.abs(at) <= self._half).all(axis=1) & (distance > beyond)
+        return _met(np.where(inside & np.isfinite(distance), distance, np.inf))
+
+    def surface(self, origin: Floats, direction: Floats, met: Meeting) -> Surface:
+        point = origin + met.distance[:, None] * direction
+        right, down = point[:, 0] + self._half[0], self._half[1] - point[:, 1]
+        uv = np.stack([right / self.tile, down / self._tile_height], axis=1)
+        return Surface(
+            point,
+            _rows([0.0, 0.0, 1.0], len(point)),
+            uv,
+            _rows([self.tile, 0.0, 0.0], len(point)),
+            _rows([0.0, -self._tile_height, 0.0], len(point)),
+            np.zeros((len(point), 3)),
+        )
+
+
+@final
+class Sphere(Shape):
+    """The unit sphere, poles on the y axis; `repeat` tiles over the front half, 2 `repeat` around.
+
+    Tiles keep their proportions on the equator and shrink towards the poles. Its radius is
+    repeat / pi tile widths.
+    """
+
+    def __init__(self, *, repeat: int = 1, aspect: float = 1.0) -> None:
+        self.half_height = 1.04
+        self.tile = np.pi / repeat
+        self._aspect = aspect
+
+    def meet(self, origin: Floats, direction: Floats, beyond: Floats) -> Meeting:
+        along = np.einsum("ij,ij->i", origin, direction)
+        return _met(_nearest(_roots(1.0, along, np.einsum("ij,ij->i", origin, origin) - 1), beyond))
+
+    def surface(self, origin: Floats, direction: Floats, met: Meeting) -> Surface:
+        point = origin + met.distance[:, None] * direction
+        normal = point / np.linalg.norm(point, axis=1, keepdims=True)
+        x, y, z = normal.T
+        round_y = np.arctan2(x, z)
+        radius = np.hypot(x, z)
+        polar = np.arctan2(radius, y)
+        # On the very pole any tangent will do: the one at azimuth 0.
+        east = np.stack([np.cos(round_y), 0 * x, -np.sin(round_y)], axis=1)
+        south = np.cross(east, normal)
+        uv = np.stack([0.5 + round_y / np.pi, polar / np.pi], axis=1) * (np.pi / self.tile)
+        uv[:, 1] *= self._aspect
+        du = east * np.maximum(radius, NEAR)[:, None] * self.tile
+        return Surface(
+            normal, normal, uv, du, south * (self.tile / self._aspect),
+            _rows([1.0, 0.0, 1.0], len(point)),
+        )  # fmt: skip
+
+
+@final
+class Cylinder(Shape):
+    """An open tube of radius 1 about the y axis; its front half shows `repeat` x `repeat` tiles."""
+
+    def __init__(self, *, repeat: int = 1, aspect: float = 1.0) -> None:
+        self.tile = np.pi / repeat
+        self._tile_height = self.tile / aspect
+        self._half = np.pi / aspect / 2
+        self.half_height = 1.04 * max(1.0, self._half)
+
+    def meet(self, origin: Floats, direction: Floats, beyond: Floats) -> Meeting:
+        flat, way = origin[:, ::2], direction[:, ::2]
+        square = np.einsum("ij,ij->i", way, way)
+        along = np.einsum("ij,ij->i", flat, way)
+        roots = _roots(square, along, np.einsum("ij,ij->i", flat, flat) - 1)
+        with np.errstate(invalid="ignore"):
+            height = origin[:, 1:2] + roots * direction[:, 1:2]
+            roots = np.where(np.abs(height) <= self._half, roots, np.inf)
+        return _met(_nearest(roots, beyond))
+
+    def surface(self, origin: Floats, direction: Floats, met: Meeting) -> Surface:
+        point = origin + met.distance[:, None] * direction
+        round_y = np.arctan2(point[:, 0], point[:, 2])
+        sin, cos = np.sin(round_y), np.cos(round_y)
+        normal = np.stack([sin, 0 * sin, cos], axis=1)
+        uv = np.stack(
+            [(np.pi / 2 + round_y) / self.tile, (self._half - point[:, 1]) / self._tile_height],
+            axis=1,
+        )
+        du = np.stack([cos, 0 * sin, -sin], axis=1) * self.tile
+        dv = _rows([0.0, -self._tile_height, 0.0], len(point))
+        return Surface(point, normal, uv, du, dv, _rows([1.0, 0.0, 0.0], len(point)))
+
+
+def _met(distance: Floats) -> Meeting:
+    return Meeting(distance, np.zeros(len(distance), np.intp))
+
+
+def _rows(vector: list[float], count: int) -> Floats:
+    return np.broadcast_to(np.array(vector), (count, len(vector)))
+
+
+def _roots(square: Floats | float, half_linear: Floats, constant: Floats) -> Floats:
+    """(m, 2) real roots of square t² + 2 half_linear t + constant; inf where there is none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = np.sqrt(half_linear**2 - square * constant)
+        # The sum without cancellation; the other root from the product of both.
+        far = -half_linear - np.copysign(root, half_linear)
+        roots = np.stack([far / square, constant / far], axis=1)
+    return np.where(np.isfinite(roots), roots, np.inf)
+
+
+def _nearest(roots: Floats, beyond: Floats) -> Floats:
+    return np.where(roots > beyond[:, None], roots, np.inf).min(axis=1)
+
+
+SHAPES = ("plane", "sphere", "cylinder")
+
+
+def shape_of(name: str, *, repeat: int, aspect: float, picture: float) -> Shape:
+    """A shape by its name.
+
+    Args:
+        name: one of `SHAPES`.
+        repeat: tiles across its front. aspect: tile width / tile height.
+        picture: width / height of the picture, which a plane fills.
+
+    Raises:
+        ValueError: no such shape.
+    """
+    if name == "plane":
+        return Plane(repeat=repeat, aspect=aspect, picture=picture)
+    if name == "sphere":
+        return Sphere(repeat=repeat, aspect=aspect)
+    if name == "cylinder":
+        return Cylinder(repeat=repeat, aspect=aspect)
+    raise ValueError(f"no shape {name!r}; there are {', '.join(SHAPES)}")
