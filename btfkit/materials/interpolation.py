@@ -85,7 +85,7 @@ class Interpolation(Material):
     @classmethod
     def shapes(cls, spec: InterpolationSpec, header: Header) -> dict[str, tuple[int, ...]]:
         names = ("light", "view", *spec.positions)
-        found: dict[str, tuple[int, ...]] = {name: (spec.pairs, 3) for name in names}
+        found: dict[str, tuple[int, ...]] = dict.fromkeys(names, (spec.pairs, 3))
         found["texture"] = (spec.pairs, *spec.size, spec.channels)
         if spec.valid:
             found["texture.valid"] = (spec.valid, *spec.size)
