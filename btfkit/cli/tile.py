@@ -20,8 +20,9 @@ def tile_verb(bar: Bar, *, source: Path, out: Path | None, force: bool) -> Outco
     from btfkit.cli.tiling import tile_file
 
     found, final = tile_file(source, out, force=force, progress=bar)
-    rows, cols = found.period
+    (rows, cols), (p, q) = found.period, found.index.size
+    what = "tiles as it is" if found.drift is None else f"tile of {p} x {q}"
     return Outcome(
-        f"{final}: period {rows} x {cols} texels, seam ratio {found.seam_ratio:.3f}",
-        {"out": final, "period": (rows, cols), "seam_ratio": found.seam_ratio},
+        f"{final}: {what}, period {rows} x {cols} texels, seam ratio {found.seam_ratio:.3f}",
+        {"out": final, **found.record(), "seam_ratio": found.seam_ratio},
     )

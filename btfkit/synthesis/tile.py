@@ -1,0 +1,226 @@
+"""Images, BTFs and NeuBTF models made to tile."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit import directions, metrics
+from btfkit.btf import BTF
+from btfkit.materials.evaluation import texel_centres
+from btfkit.materials.neubtf import NeuBTF
+from btfkit.synthesis.drift import Drift
+from btfkit.synthesis.indexmap import IndexMap
+from btfkit.synthesis.period import Side, side_of
+from btfkit.synthesis.seam import closed_cut, open_cut
+from btfkit.synthesis.summary import Summary, spread_out
+from btfkit.synthesis.textures import Strengths, TiledTextures, bent
+
+Array = NDArray[np.float32]
+# Slices that are looked at for the one map of all.
+_SLICES = 8
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Tiling:
+    """How a sample was made to tile.
+
+    Attributes:
+        index: where each texel of the tile comes from.
+        sides: what was found of the rows and of the columns.
+        drift: the fields that can take drift away; None where the sample tiles as it is.
+        seam_ratio: mean |step| across the ends of the tile over that inside, near 1 where it tiles.
+    """
+
+    index: IndexMap
+    sides: tuple[Side, Side]
+    drift: Drift | None
+    seam_ratio: float
+
+    @staticmethod
+    def unchanged(size: tuple[int, int], seam_ratio: float) -> Tiling:
+        """Of a sample that says it tiles."""
+        h, w = size
+        sides = Side(h, 0, h, 0, 1.0), Side(w, 0, w, 0, 1.0)
+        return Tiling(IndexMap.identity(h, w), sides, None, seam_ratio)
+
+    def line(self) -> str:
+        """The step as history has it."""
+        if self.drift is None:
+            return "found to tile as it is"
+        (h, w), (p, q) = self.index.source, self.index.size
+        return f"tiled: {p} x {q} of {h} x {w} texels, joined by cuts of least error"
+
+    def record(self) -> dict[str, Any]:
+        """What was found, in JSON types."""
+        return {
+            "period": list(self.period),
+            "tile": list(self.index.size),
+            "of": list(self.index.source),
+            "overlap": [side.overlap for side in self.sides],
+            "agreement": [round(side.agreement, 4) for side in self.sides],
+        }
+
+    @property
+    def period(self) -> tuple[int, int]:
+        """Rows and columns after which the sample repeats; those of the tile where none do."""
+        if self.drift is None:
+            return self.index.source
+        return (
+            self.sides[0].period or self.sides[0].tile,
+            self.sides[1].period or self.sides[1].tile,
+        )
+
+
+def make_tileable(image: Array) -> Array:
+    """An image (h, w, c), linear, as a tile; the same values where it tiles already."""
+    return tile_image(image)[0]
+
+
+def tile_image(image: Array) -> tuple[Array, Tiling]:
+    """An image as a tile, and how it was made.
+
+    Args:
+        image: (h, w, c) linear; NaN where not measured.
+
+    Returns:
+        (p, q, c) float32 tile: texels of the image times the gain that takes its drift away.
+
+    Raises:
+        ValueError: no (h, w, c), no size, or nothing measured.
+    """
+    if image.ndim != 3 or min(image.shape) < 1:
+        raise ValueError(f"the image has shape {image.shape}; expected (h, w, c)")
+    values = np.where(np.isfinite(image), image, np.nan).astype(np.float32, copy=False)
+    tiling = _tiling(Summary.of([values]))
+    tile = values
+    if tiling.drift is not None:
+        tile = bent(values, tiling.index, tiling.drift, tiling.drift.strengths(values))
+    return tile, replace(tiling, seam_ratio=metrics.seam_ratio(tile))
+
+
+def tile_btf(btf: BTF) -> tuple[BTF, Tiling]:
+    """A BTF as a tile: one map for all slices, each slice without its own drift; lazy.
+
+    A sample that wraps is taken at its word and left as it is. Positions of near lights and views
+    become directions: of a tile every place is anywhere.
+
+    Raises:
+        ValueError: nothing measured in the slices that were looked at.
+    """
+    chosen = spread_out(btf.light, btf.view, _SLICES)
+    if btf.wrap == "wrap":
+        return btf, Tiling.unchanged(btf.shape[1:3], _seam(btf, chosen))
+    tiling = _tiling(Summary.of(btf.texture(i) for i in chosen))
+    index, drift = tiling.index, tiling.drift
+    changes: dict[str, Any] = {
+        "wrap": "wrap",
+        "provenance": {**btf.provenance, "tiled": tiling.record() | {"looked_at": chosen}},
+        "history": (*btf.history, tiling.line()),
+        **_far(btf, index),
+    }
+    if drift is not None:
+        strengths = Strengths(btf, drift)
+        changes["textures"] = TiledTextures(btf.textures, index, drift, strengths)
+        if btf.validity is not None:
+            changes["validity"] = btf.validity[:, index.rows, index.cols]
+        if btf.variance is not None:
+            changes["variance"] = TiledTextures(btf.variance, index, drift, strengths, power=2)
+    tile = replace(btf, **changes)
+    return tile, replace(tiling, seam_ratio=_seam(tile, chosen))
+
+
+def tile_neubtf(material: NeuBTF) -> tuple[NeuBTF, Tiling]:
+    """A NeuBTF as a tile: the map is found on what it answers and taken for its latents.
+
+    Latents are moved, never mixed or bent: between two materials there need not be a third.
+    """
+    h, w = material.spec.size
+    if material.header.wrap == "wrap":
+        return material, Tiling.unchanged((h, w), _seam_of_answers(material))
+    tiling = _tiling(Summary.of(_answers(material)))
+    p, q = tiling.index.size
+    grid = material.header.grid
+    header = replace(
+        material.header,
+        grid=(max(1, round(grid[0] * p / h)), max(1, round(grid[1] * q / w))),
+        wrap="wrap",
+        provenance={**material.header.provenance, "tiled": tiling.record()},
+    )
+    weights = {**material.weights, "texture": tiling.index.of(material.weights["texture"])}
+    tile = NeuBTF(replace(material.spec, size=(p, q)), weights, header)
+    return tile, replace(tiling, seam_ratio=_seam_of_answers(tile))
+
+
+def _tiling(summary: Summary) -> Tiling:
+    """The map that a summary of slices allows; its seam ratio is not known yet."""
+    rows = side_of(summary.flat, summary.raw)
+    cols = side_of(*(np.swapaxes(part, 1, 2) for part in (summary.flat, summary.raw)))
+    if not rows.overlap and not cols.overlap:
+        return Tiling(IndexMap.identity(rows.size, cols.size), (rows, cols), None, 1.0)
+    drift = Drift.of((rows.start, cols.start), (rows.tile, cols.tile), (rows.overlap, cols.overlap))
+    return Tiling(_joined(summary, rows, cols), (rows, cols), drift, 1.0)
+
+
+def _joined(summary: Summary, rows: Side, cols: Side) -> IndexMap:
+    """The tile whose ends are joined by cuts of least error.
+
+    First the columns are joined over all rows of the window. What that gives has no side any
+    more, so the cut that joins its rows runs around it and closes, whatever it crosses.
+    """
+    height = rows.tile + rows.overlap
+    row = np.arange(rows.start, rows.start + height)[:, None]
+    col = cols.start + np.broadcast_to(np.arange(cols.tile), (height, cols.tile))
+    if cols.overlap:
+        near = np.broadcast_to(row, (height, cols.overlap)), col[:, : cols.overlap]
+        parts = summary.mismatch(near, (near[0], near[1] + cols.tile))
+        # Without an overlap of the rows their ends meet already: the cut must meet itself too.
+        cut = (open_cut if rows.overlap else closed_cut)(*(part.T for part in parts))
+        far = np.arange(cols.tile) < cut[:, None]
+        col = col + cols.tile * far
+    take = np.broadcast_to(np.arange(rows.tile)[:, None], (rows.tile, cols.tile))
+    if rows.overlap:
+        whole = np.broadcast_to(row, col.shape)
+        band, beyond = slice(0, rows.overlap), slice(rows.tile, height)
+        cut = closed_cut(*summary.mismatch((whole[band], col[band]), (whole[beyond], col[beyond])))
+        take = take + rows.tile * (take < cut)
+    return IndexMap(
+        rows.start + take, np.take_along_axis(col, take, axis=0), (rows.size, cols.size)
+    )
+
+
+def _far(btf: BTF, index: IndexMap) -> dict[str, Any]:
+    """Directions instead of positions, seen from the middle of what the tile was cut from."""
+    if btf.texel_mm is None:
+        return {"light_position": None, "view_position": None}
+    (h, w), (row, col) = index.source, (float(index.rows.mean()), float(index.cols.mean()))
+    at = np.array([col + 0.5 - w / 2, h / 2 - row - 0.5, 0]) * btf.texel_mm
+    found: dict[str, Any] = {}
+    for name in ("light", "view"):
+        position = getattr(btf, f"{name}_position")
+        if position is not None:
+            found[name] = directions.normalize(position - at).astype(np.float32)
+            found[f"{name}_position"] = None
+    return found
+
+
+def _seam(btf: BTF, pairs: Sequence[int]) -> float:
+    return float(np.mean([metrics.seam_ratio(btf.texture(i)) for i in pairs]))
+
+
+def _answers(material: NeuBTF) -> Iterator[Array]:
+    """What a model answers at its texel centres under a few pairs."""
+    table = directions.bonn81()
+    light, view = np.tile(table, (len(table), 1)), np.repeat(table, len(table), axis=0)
+    uv = texel_centres(*material.spec.size)
+    for pair in spread_out(light, view, _SLICES):
+        yield material.evaluate(uv, light[pair], view[pair]).reflectance
+
+
+def _seam_of_answers(material: NeuBTF) -> float:
+    return float(np.mean([metrics.seam_ratio(answer) for answer in _answers(material)]))
