@@ -40,7 +40,9 @@ class FormatError(BtfkitError):
     def __init__(
         self, path: str | os.PathLike[str], message: str, *, remedy: str | None = None
     ) -> None:
-        super().__init__(f"{os.fspath(path)}: {message}", remedy=remedy)
+        # One line, whatever a name in an archive or a foreign library says.
+        line = " ".join(f"{os.fspath(path)}: {message}".split())
+        super().__init__(line, remedy=remedy)
         self.path = os.fspath(path)
 
 

@@ -19,7 +19,7 @@ from btfkit import directions
 from btfkit.errors import FormatError
 
 _ANGLE = re.compile(r"(?<![A-Za-z])(tl|pl|tv|pv)[ _]?(-?\d+(?:\.\d+)?)", re.IGNORECASE)
-_NUMBER = re.compile(r"(\d+) ")
+_NUMBER = re.compile(r"(\d{1,12}) ")
 
 
 @final

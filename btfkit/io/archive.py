@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import posixpath
+import stat
 import threading
 import zipfile
 import zlib
@@ -15,11 +16,12 @@ from numpy.typing import NDArray
 
 from btfkit.errors import FormatError
 
-# One member that unpacks to more than this is no image of a sample.
+# One member of more bytes than this is no image of a sample.
 _MOST_BYTES = 1 << 31
 # Deflate shrinks at most 1032 times; images hardly at all.
 _MOST_RATIO = 200
-_MOST_TEXT = 1 << 28
+# A manifest of 300 000 images.
+MOST_TEXT = 1 << 26
 _IGNORED = {"thumbs.db", ".ds_store", "desktop.ini"}
 
 
@@ -32,6 +34,8 @@ class Archive:
 
     Raises:
         FormatError: a damaged zip, or one with members that leave it or stand in it twice.
+
+    A link inside a folder may not lead out of it either: `read` refuses it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -49,21 +53,21 @@ class Archive:
         return sorted(p.relative_to(self.path).as_posix() for p in found if _counts(p))
 
     def __contains__(self, name: str) -> bool:
-        return name in self._infos if self._zip else (self.path / name).is_file()
+        if self._zip:
+            return name in self._infos
+        try:
+            return (self.path / name).is_file()
+        except OSError:  # a name longer than any file's
+            return False
 
     def read(self, name: str) -> bytes:
         """The bytes of a member. May be called from several threads.
 
         Raises:
-            FormatError: missing, damaged, encrypted, or larger than it says.
+            FormatError: missing, damaged, encrypted, larger than it says, or outside.
         """
         if not self._zip:
-            try:
-                return (self.path / name).read_bytes()
-            except FileNotFoundError as error:
-                raise FormatError(
-                    self.path / name, "the file has gone since it was listed"
-                ) from error
+            return self._read_file(self.path / name)
         info = self._infos[name]
         try:
             with self._file().open(info) as member:
@@ -89,16 +93,24 @@ class Archive:
         Raises:
             FormatError: binary, or far too long for a text that somebody wrote.
         """
+        size = self._infos[name].file_size if self._zip else (self.path / name).stat().st_size
+        if size > MOST_TEXT:
+            raise FormatError(self.path / name, f"{size} bytes of text; at most {MOST_TEXT}")
         data = self.read(name)
-        if len(data) > _MOST_TEXT or b"\0" in data:
+        if b"\0" in data:
             raise FormatError(self.path / name, "not a text file")
         try:
             return data.decode("utf-8-sig")
         except UnicodeDecodeError:
             return data.decode("latin-1")
 
-    def table(self, name: str, columns: int) -> NDArray[np.float64]:
+    def table(self, name: str, columns: int, *, comments: str = "") -> NDArray[np.float64]:
         """(rows, columns) numbers of a text member, separated by commas or white space.
+
+        Args:
+            name: of the member.
+            columns: how many numbers a line has.
+            comments: lines that start with one of these characters are left out.
 
         Raises:
             FormatError: a line that has not so many finite numbers, or no line at all.
@@ -106,10 +118,11 @@ class Archive:
         rows = []
         for number, line in enumerate(self.text(name).splitlines(), 1):
             words = line.replace(",", " ").split()
-            if not words:
+            if not words or words[0][0] in comments:
                 continue
             try:
-                row = [float(word) for word in words]
+                # Python reads 1_5 as 15.
+                row = [] if "_" in line else [float(word) for word in words]
             except ValueError:
                 row = []
             if len(row) != columns or not np.isfinite(row).all():
@@ -150,6 +163,24 @@ class Archive:
             members.setdefault(PurePosixPath(member).name.lower(), []).append(member)
         return members
 
+    def _read_file(self, path: Path) -> bytes:
+        try:
+            if not path.resolve().is_relative_to(self._root):
+                raise FormatError(
+                    path, "is a link that leaves the folder", remedy="put the file in its place"
+                )
+            if path.stat().st_size > _MOST_BYTES:
+                raise FormatError(path, f"is larger than {_MOST_BYTES} bytes")
+            return path.read_bytes()
+        except FileNotFoundError as error:
+            raise FormatError(path, "the file has gone since it was listed") from error
+        except RuntimeError as error:  # of Path.resolve
+            raise FormatError(path, "is a link that leads to itself") from error
+
+    @functools.cached_property
+    def _root(self) -> Path:
+        return self.path.resolve()
+
     def _checked(self) -> dict[str, zipfile.ZipInfo]:
         infos: dict[str, zipfile.ZipInfo] = {}
         try:
@@ -164,6 +195,12 @@ class Archive:
                 continue
             if name.is_absolute() or ".." in name.parts or (name.parts and ":" in name.parts[0]):
                 raise FormatError(self.path, f"member {info.filename!r} would leave the archive")
+            if stat.S_ISLNK(info.external_attr >> 16):
+                raise FormatError(
+                    self.path,
+                    f"member {info.filename!r} is a link",
+                    remedy="pack the files that links lead to",
+                )
             if str(name) in infos:
                 raise FormatError(
                     self.path, f"member {info.filename!r} stands in the archive twice"

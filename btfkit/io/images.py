@@ -19,6 +19,7 @@ from btfkit.io.radiance import check_size
 
 Array = NDArray[np.float32]
 T = TypeVar("T")
+_MOST_SCANS = 100
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr", ".bmp"}
 
 
@@ -53,7 +54,7 @@ def read(name: str, data: bytes, *, transfer: str) -> Array:
 def _read_codes(name: str, data: bytes, transfer: str) -> Array:
     import cv2
 
-    check_size(name, *headers.size_of(name, data))
+    check_size(name, *headers.size_of(name, data), coded=len(data))
     _check_whole(name, data)
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
     try:
@@ -66,17 +67,32 @@ def _read_codes(name: str, data: bytes, transfer: str) -> Array:
         codes = codes[..., None]
     if codes.shape[2] == 3:
         codes = codes[..., ::-1]
-    if codes.dtype in (np.uint8, np.uint16):
-        return colour.table(transfer, codes.itemsize * 8)[codes]
+    if codes.dtype == np.uint8:
+        linear = cv2.LUT(np.ascontiguousarray(codes), colour.table(transfer, 8))
+        return np.asarray(linear, np.float32).reshape(codes.shape)
+    if codes.dtype == np.uint16:
+        return _looked_up(codes, colour.table(transfer, 16))
     if codes.dtype == np.float32:
         return np.ascontiguousarray(codes)
     raise FormatError(name, f"pixels are {codes.dtype}; expected 8 or 16 bit, or float32")
 
 
+def _looked_up(codes: NDArray[np.uint16], table: Array) -> Array:
+    """`table[codes]` row by row: numpy makes an index of eight bytes a value."""
+    out = np.empty(codes.shape, np.float32)
+    for row, line in zip(out, codes, strict=True):
+        row[...] = table[line]
+    return out
+
+
 def _check_whole(name: str, data: bytes) -> None:
     """Refuse what decoders fill with grey or noise without a word: cut files, damaged chunks."""
-    if data.startswith(b"\xff\xd8") and b"\xff\xd9" not in data[-4096:]:
-        raise FormatError(name, "the image is cut short", remedy="copy it again")
+    if data.startswith(b"\xff\xd8"):
+        if b"\xff\xd9" not in data[-4096:]:
+            raise FormatError(name, "the image is cut short", remedy="copy it again")
+        # Each scan of a progressive JPEG goes over the whole picture; encoders write ten.
+        if data.count(b"\xff\xda") > _MOST_SCANS:
+            raise FormatError(name, f"the JPEG has more than {_MOST_SCANS} scans")
     if not data.startswith(b"\x89PNG"):
         return
     at, kind = 8, b""
@@ -104,21 +120,21 @@ def read_exr(name: str, data: bytes) -> tuple[Array, tuple[str, ...], dict[str, 
     """
     import OpenImageIO as oiio
 
-    def decode(source: Any) -> tuple[Array, Any]:
+    def decode(source: Any) -> tuple[Array, tuple[str, ...], dict[str, Any]]:
         spec = source.spec()
         if spec.deep:
             raise FormatError(name, "the EXR is deep; expected flat pixels")
-        check_size(name, spec.height, spec.width, spec.nchannels)
+        check_size(name, spec.height, spec.width, spec.nchannels, coded=len(data))
         pixels = source.read_image(oiio.FLOAT)
         fault = source.geterror()
         if pixels is None or fault:
             raise FormatError(name, f"the EXR cannot be decoded ({fault})", remedy="copy it again")
-        return _in_display_window(name, np.asarray(pixels, np.float32), spec), spec
+        values = _in_display_window(name, np.asarray(pixels, np.float32), spec, len(data))
+        attributes = {attribute.name: attribute.value for attribute in spec.extra_attribs}
+        return values, tuple(spec.channelnames), attributes
 
-    values, spec = _with_exr(name, data, decode)
-    names = tuple(spec.channelnames)
+    values, names, attributes = _with_exr(name, data, decode)
     order = sorted(range(len(names)), key=lambda i: (_RGB.get(names[i], 3), i))
-    attributes = {attribute.name: attribute.value for attribute in spec.extra_attribs}
     return np.ascontiguousarray(values[..., order]), tuple(names[i] for i in order), attributes
 
 
@@ -137,18 +153,20 @@ def _with_exr(name: str, data: bytes, use: Callable[[Any], T]) -> T:
             raise FormatError(name, f"the EXR cannot be opened ({oiio.geterror()})")
         try:
             return use(source)
+        except UnicodeDecodeError as error:
+            raise FormatError(name, "a name in the EXR is not UTF-8") from error
         finally:
             source.close()
 
 
-def _in_display_window(name: str, pixels: Array, spec: Any) -> Array:
+def _in_display_window(name: str, pixels: Array, spec: Any, coded: int) -> Array:
     """The whole picture of an EXR that stores a part of it; NaN where it stores nothing."""
     data_window = (spec.y, spec.x, spec.height, spec.width)
     display = (spec.full_y, spec.full_x, spec.full_height, spec.full_width)
     values = pixels.reshape(spec.height, spec.width, -1)
     if data_window == display:
         return values
-    check_size(name, spec.full_height, spec.full_width, spec.nchannels)
+    check_size(name, spec.full_height, spec.full_width, spec.nchannels, coded=coded)
     row, col = spec.y - spec.full_y, spec.x - spec.full_x
     out = np.full((spec.full_height, spec.full_width, spec.nchannels), np.nan, np.float32)
     top, left = max(row, 0), max(col, 0)

@@ -6,6 +6,7 @@ import hashlib
 import importlib.metadata
 import os
 import platform
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any, final
 from btfkit import io
 from btfkit.btf import BTF
 from btfkit.files import refuse_existing
-from btfkit.io import store_write
+from btfkit.io import store, store_write
 
 # Files up to this size are hashed whole; of larger ones the two ends and the size.
 _HASH_WHOLE = 1 << 30
@@ -101,7 +102,15 @@ def ingest(
     }
     history = (*btf.history, f"ingested from {name}")
     record = replace(btf, provenance=provenance, history=history)
-    return store_write.write(record, final, dtype=dtype, jobs=jobs, force=force, progress=progress)
+    path = store_write.write(record, final, dtype=dtype, jobs=jobs, force=force, progress=progress)
+    masked = store.masked_texels(path)
+    if masked:
+        n, h, w, _ = btf.shape
+        warnings.warn(
+            f"{os.fspath(source)}: {masked} of {n * h * w} texels are not finite; they are masked",
+            stacklevel=2,
+        )
+    return path
 
 
 def source_hash(source: Path) -> dict[str, Any]:

@@ -23,8 +23,8 @@ from btfkit.io import images, named
 from btfkit.io.archive import Archive
 from btfkit.textures import Array
 
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_LINE = re.compile(rf"(.+?)[\s,;]+({_NUMBER})[\s,;]+({_NUMBER})[\s,;]+({_NUMBER})[\s,;]*")
+_BETWEEN = " \t,;"
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _SHORTEST = 1e-4
 
 
@@ -110,14 +110,14 @@ def parse(path: str, text: str) -> list[tuple[str, list[float]]]:
     count = int(lines[0].strip(" ,;"))
     entries = []
     for number, line in enumerate(lines[1:], 2):
-        match = _LINE.fullmatch(line)
-        if match is None:
+        name, numbers = _split(line)
+        if not name or not all(map(_is_number, numbers)):
             raise FormatError(path, f"line {number} is {line[:60]!r}; expected: file x y z")
-        vector = np.array([float(match[i]) for i in (2, 3, 4)])
+        vector = np.array([float(each) for each in numbers])
         length = float(np.linalg.norm(vector))
         if not _SHORTEST <= length < np.inf:
             raise FormatError(path, f"line {number}: {vector.tolist()} is not a direction")
-        entries.append((match[1].strip("\"' \t"), (vector / length).tolist()))
+        entries.append((name.strip("\"' \t"), (vector / length).tolist()))
     if not entries:
         raise FormatError(path, "names no image")
     if count != len(entries):
@@ -126,6 +126,24 @@ def parse(path: str, text: str) -> list[tuple[str, list[float]]]:
             stacklevel=3,
         )
     return entries
+
+
+def _split(line: str) -> tuple[str, list[str]]:
+    """A name, which may hold separators itself, and the last three words.
+
+    From the right, one pass: an expression for the whole line would go through it over and over.
+    """
+    rest, words = line, []
+    for _ in range(3):
+        rest = rest.rstrip(_BETWEEN)
+        cut = max(rest.rfind(each) for each in _BETWEEN) + 1
+        words.append(rest[cut:])
+        rest = rest[:cut]
+    return rest.rstrip(_BETWEEN), words[::-1]
+
+
+def _is_number(word: str) -> bool:
+    return len(word) < 64 and _NUMBER.fullmatch(word) is not None
 
 
 def y_sign(orientation: str) -> int:

@@ -34,8 +34,8 @@ def detect(path: Path) -> bool:
     """Whether it is a manifest, or a folder or zip with a manifest.json or manifest.csv."""
     if path.is_file() and path.suffix.lower() == ".json":
         with path.open("rb") as file:
-            start = file.read(1)
-            return start == b"{" and b'"images"' in file.read()
+            start = file.read(archives.MOST_TEXT)
+            return start.lstrip()[:1] == b"{" and b'"images"' in start
     if path.is_file() and path.suffix.lower() == ".csv":
         with path.open("rb") as file:
             return bool(poses.csv_columns(file.read(4096).decode("utf-8-sig", "replace")))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from btfkit.io.poses import MM, End, Pose
 from btfkit.textures import Array
 
 _ABOVE = End((0.0, 0.0, 1.0), None)
+_LARGEST = 10**15
 
 
 @final
@@ -64,6 +64,8 @@ class Head:
                 return default
             if not isinstance(value, kind) or isinstance(value, bool):
                 raise FormatError(path, f"{name} is {str(value)[:60]!r}")
+            if isinstance(value, int) and abs(value) > _LARGEST:
+                raise FormatError(path, f"{name} is no sensible number")
             return value
 
         def names(name: str) -> tuple[str, ...]:
@@ -264,7 +266,10 @@ def _near_light(path: Path, head: Head, light_mm: Array | None, channels: int) -
 
 def _power(path: Path, power: Any, units: Any) -> tuple[float, ...]:
     values = power if isinstance(power, list) else [power]
-    numbers = [isinstance(v, (int, float)) and math.isfinite(v) and v > 0 for v in values]
+    numbers = [
+        isinstance(v, (int, float)) and not isinstance(v, bool) and 1 / _LARGEST < v < _LARGEST
+        for v in values
+    ]
     if not values or not all(numbers):
         raise FormatError(path, f"light_power is {str(power)[:60]}; expected numbers above 0")
     return tuple(float(value) * MM[units] ** 2 for value in values)

@@ -23,6 +23,8 @@ from btfkit.textures import as_textures
 
 _BINS = (90, 90, 180)
 _SCALE = np.array([1.0, 1.15, 1.66]) / 1500
+# No surface has an f_r like that; a flipped bit has.
+MOST = 1e9
 _TABLES = {"bonn81": directions.bonn81, "bonn151": directions.bonn151}
 
 
@@ -92,7 +94,7 @@ def lookup(
         np.clip(bins.astype(int), 0, size - 1) for bins, size in zip((i, j, k), _BINS, strict=True)
     )
     found = np.moveaxis(planes[(slice(None), *index)], 0, -1) * _SCALE
-    invalid = ~(found >= 0).all(axis=-1)
+    invalid = ~((found >= 0) & (found < MOST)).all(axis=-1)
     found[invalid] = np.nan
     return found
 

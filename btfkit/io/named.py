@@ -72,6 +72,7 @@ def read_named(
     suffixes: set[str],
     cosine: str = "in",
     channels: Callable[[], tuple[str, ...]] | None = None,
+    relit: Callable[[Array, Array], Array] | None = None,
     number: Callable[[Angles], int] | None = None,
     provenance: Mapping[str, Any],
     **more: Any,
@@ -85,6 +86,7 @@ def read_named(
         cosine: "in" where the data hold the cosine of the light, "out" where it is divided out.
         channels: names, asked for once the first image is decoded; None takes RGB or Y by the
             count.
+        relit: (n, 3) lights and views of the names to (n, 3) lights as they really stood.
         number: the running number that a name with these angles ought to have; -1 for any.
         provenance: format, options and assumptions.
         **more: further fields of the BTF.
@@ -114,6 +116,8 @@ def read_named(
             stacklevel=3,
         )
     light, view = anglenames.light_and_view(angles)
+    if relit is not None:
+        light = relit(light, view)
     textures = ImageTextures(
         archive, [name for name, _ in pairs], decode, cosine_factor(cosine, light)
     )

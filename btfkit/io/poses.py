@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, final
@@ -15,6 +16,7 @@ from btfkit.errors import FormatError
 Vector = tuple[float, float, float]
 MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 _NUMBERS = ("exposure_s", "iso", "f", "footprint")
+_MOST_NESTED = 50
 
 
 @final
@@ -45,11 +47,13 @@ def from_json(path: str, text: str) -> tuple[dict[str, Any], list[Pose]]:
         FormatError: not JSON, or an entry that is none; the message names it.
     """
     try:
-        whole = json.loads(text)
+        whole = json.loads(text, parse_constant=_refused, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
         raise FormatError(path, f"not JSON ({error})") from error
     if not isinstance(whole, dict) or not isinstance(whole.get("images"), list):
         raise FormatError(path, "holds no list called images")
+    if _nested(whole) > _MOST_NESTED:
+        raise FormatError(path, f"is nested more than {_MOST_NESTED} deep")
     if whole.get("version", 1) != 1:
         raise FormatError(path, f"version {whole['version']!r}; expected 1", remedy="update btfkit")
     units = whole.get("units", "mm")
@@ -176,6 +180,30 @@ def _end_reader(names: list[str], end: str) -> Callable[[str, str, Mapping[str, 
     return None
 
 
+def _refused(constant: str) -> float:
+    raise ValueError(f"{constant} is no JSON number")
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The object of a list of pairs; a key twice would lose one in silence."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        counts = Counter(name for name, _ in pairs)
+        again = next(name for name, count in counts.items() if count > 1)
+        raise ValueError(f"the key {again[:60]!r} stands twice in one object")
+    return found
+
+
+def _nested(value: dict[str, Any]) -> int:
+    """Levels of lists and objects, counted no further than is too many."""
+    depth, level = 0, [value]
+    while level and depth <= _MOST_NESTED:
+        inner = (each.values() if isinstance(each, dict) else each for each in level)
+        level = [item for each in inner for item in each if isinstance(item, (dict, list))]
+        depth += 1
+    return depth
+
+
 def _delimiter(first: str) -> str:
     return max(",;\t", key=first.count)
 
@@ -189,7 +217,9 @@ def _vector(path: str, where: str, value: Any) -> Vector:
 
 def _number(path: str, where: str, value: Any) -> float:
     try:
-        number = float(value) if isinstance(value, (int, float, str)) else math.nan
+        # Python reads 1_5 as 15.
+        plain = isinstance(value, (int, float)) or (isinstance(value, str) and "_" not in value)
+        number = float(value) if plain else math.nan
     except (ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number) or isinstance(value, bool):

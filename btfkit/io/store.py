@@ -23,15 +23,18 @@ from btfkit.textures import Array, Textures
 
 VERSION = 1
 IMAGE_AXES = ("pair", "row", "column", "channel")
-# A texture of more values than this is a damaged header, not a sample.
-_MOST_VALUES = 1 << 31
+# More values a texture, or more pairs, than this: a damaged header, not a sample.
+_MOST_VALUES, _MOST_PAIRS = 1 << 31, 1 << 24
 _AGAIN = "ingest the source again, or copy the store again"
 
 
 def detect(path: Path) -> bool:
     """Whether `path` is a Zarr v3 group that says it is a btfkit store."""
     metadata = path / "zarr.json"
-    return metadata.is_file() and b'"btfkit"' in metadata.read_bytes()[:65536]
+    if not metadata.is_file():
+        return False
+    with metadata.open("rb") as file:
+        return b'"btfkit"' in file.read(1 << 20)
 
 
 def read(path: Path) -> BTF:
@@ -51,34 +54,35 @@ def read(path: Path) -> BTF:
     if attributes.get("quantity") != QUANTITY:
         raise FormatError(path, f"quantity {attributes.get('quantity')!r}; expected {QUANTITY!r}")
     textures = StoreTextures(path, _member(path, group, "texture"))
+    n, h, w, _ = textures.shape
 
-    def small(name: str) -> NDArray[Any] | None:
+    def small(name: str, *shapes: tuple[int, ...], kind: str = "f") -> NDArray[Any] | None:
         if name not in group:
             return None
-        return _whole(path, _member(path, group, name))
+        return _whole(path, _member(path, group, name), shapes, kind)
 
     try:
         return BTF(
             textures=textures,
-            light=_required(path, small("light"), "light"),
-            view=_required(path, small("view"), "view"),
-            light_position=small("light_position"),
-            view_position=small("view_position"),
-            validity=small("validity"),
+            light=_required(path, small("light", (n, 3)), "light"),
+            view=_required(path, small("view", (n, 3)), "view"),
+            light_position=small("light_position", (n, 3)),
+            view_position=small("view_position", (n, 3)),
+            validity=small("validity", (n, h, w), (1, h, w), kind="b"),
             variance=StoreTextures(path, _member(path, group, "variance"))
             if "variance" in group
             else None,
-            footprint=small("footprint"),
-            channels=tuple(attributes["channels"]),
-            colour=attributes["colour"],
-            texel_mm=attributes["texel_mm"],
-            wrap=attributes["wrap"],
-            licence=attributes["licence"],
-            provenance=attributes["source"],
-            history=tuple(attributes["history"]),
+            footprint=small("footprint", (n,)),
+            **_said(attributes),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FormatError(path, f"the store contradicts itself: {error}", remedy=_AGAIN) from error
+
+
+def masked_texels(path: Path) -> int:
+    """How many texels of a store hold a value that is not finite."""
+    masked = zarr.open_group(path, mode="r", zarr_format=3).attrs.get("masked_texels", 0)
+    return masked if isinstance(masked, int) else 0
 
 
 @final
@@ -91,6 +95,7 @@ class StoreTextures(Textures):
             len(shape) != 4
             or min(shape) < 1
             or int(np.prod(shape[1:], dtype=object)) > _MOST_VALUES
+            or shape[0] > _MOST_PAIRS
         ):
             raise FormatError(path, f"{array.basename} has shape {shape}", remedy=_AGAIN)
         if array.dtype not in (np.float16, np.float32) or array.chunks != (1, *shape[1:]):
@@ -138,12 +143,53 @@ def _member(path: Path, group: zarr.Group, name: str) -> zarr.Array[Any]:
     return member
 
 
-def _whole(path: Path, array: zarr.Array[Any]) -> NDArray[Any]:
-    if int(np.prod(array.shape, dtype=object)) > _MOST_VALUES:
-        raise FormatError(path, f"{array.basename} has shape {array.shape}", remedy=_AGAIN)
+def _said(attributes: dict[str, Any]) -> dict[str, Any]:
+    """What attributes say about a BTF, by its field names.
+
+    Raises:
+        KeyError, TypeError: an attribute is missing or of the wrong kind.
+    """
+    expected: dict[str, tuple[str, type | tuple[type, ...]]] = {
+        "channels": ("channels", list),
+        "colour": ("colour", str),
+        "texel_mm": ("texel_mm", (int, float, type(None))),
+        "wrap": ("wrap", str),
+        "licence": ("licence", (str, type(None))),
+        "provenance": ("source", dict),
+        "history": ("history", list),
+    }
+    said: dict[str, Any] = {}
+    for name, (key, kind) in expected.items():
+        value = attributes[key]
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise TypeError(f"{key} is {str(value)[:60]!r}")
+        if isinstance(value, list):
+            if not all(isinstance(each, str) for each in value):
+                raise TypeError(f"{key} is {str(value)[:60]}; expected texts")
+            value = tuple(value)
+        said[name] = float(value) if name == "texel_mm" and value is not None else value
+    return said
+
+
+def _whole(
+    path: Path, array: zarr.Array[Any], shapes: tuple[tuple[int, ...], ...], kind: str
+) -> NDArray[Any]:
+    """All of a small array of one of the given shapes."""
+    if array.shape not in shapes or array.dtype.kind != kind:
+        raise FormatError(
+            path, f"{array.basename} is {array.dtype} of shape {array.shape}", remedy=_AGAIN
+        )
     try:
+        # Zarr answers a missing chunk with the fill value, silently.
+        lacking = array.nchunks - array.nchunks_initialized
+        if lacking > 0:
+            raise FormatError(
+                path, f"{lacking} chunks of {array.basename!r} are missing", remedy=_AGAIN
+            )
         return np.asarray(array[...])
-    except Exception as error:
+    except FormatError:
+        raise
+    except Exception as error:  # whatever the codecs raise on damaged bytes
         raise FormatError(
             path, f"array {array.basename!r} is damaged ({error})", remedy=_AGAIN
         ) from error

@@ -3,16 +3,18 @@
 The store grows in `.NAME.partial` beside its final name. A shard is the unit of work: one
 worker decodes the run of pairs of one shard, writes it and notes it in a journal. A later
 run with the same source and options goes on from the journal; when all shards are there
-the folder is renamed.
+the folder is renamed. A lock keeps a second run out as long as the first lives.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -64,15 +66,45 @@ def write(
 
     Raises:
         FileExistsError: `path` exists and `force` is False.
-        BtfkitError: `dtype` is "float16" and a value exceeds 6e4.
+        BtfkitError: `dtype` is "float16" and a value exceeds 6e4, or another run writes it.
     """
     final = refuse_existing(path, force=force)
+    with _alone(final):
+        if dtype is None and _begun(btf, final, "float32"):
+            # An earlier run found that half does not do.
+            return _write(btf, final, "float32", jobs, progress)
+        try:
+            return _write(btf, final, dtype or "float16", jobs, progress)
+        except HalfRangeError:
+            if dtype is not None:
+                raise
+            return _write(btf, final, "float32", jobs, progress)
+
+
+@contextmanager
+def _alone(final: Path) -> Iterator[None]:
+    """Nobody else writes `final` meanwhile; a killed process lets go of its lock.
+
+    Raises:
+        BtfkitError: another process does.
+    """
     try:
-        return _write(btf, final, dtype or "float16", jobs, progress)
-    except HalfRangeError:
-        if dtype is not None:
-            raise
-        return _write(btf, final, "float32", jobs, progress)
+        import fcntl
+    except ImportError:  # Windows: two runs at once are up to the user
+        yield
+        return
+    path = final.with_name(f".{final.name}.lock")
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BtfkitError(
+                f"{final}: another run is writing it", remedy="wait for it or end it"
+            ) from error
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
 
 
 def _write(
@@ -129,14 +161,12 @@ class _Job:
     @staticmethod
     def begin(btf: BTF, final: Path, dtype: str) -> _Job:
         """Open the partial folder: the earlier one where it is of the same job, or a new one."""
-        folder = final.with_name(f".{final.name}.partial")
-        identity = {"dtype": dtype, "shape": list(btf.shape), "attributes": _attributes(btf)}
-        journal = _journal(folder)
-        if not journal or journal[0] != json.loads(json.dumps(identity)):
+        folder = _partial(final)
+        if not _begun(btf, final, dtype):
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
             _create(folder, btf, dtype)
-            _append(folder, identity)
+            _append(folder, _identity(btf, dtype))
         group = zarr.open_group(folder, mode="r+", zarr_format=3)
         images: dict[str, tuple[Textures, zarr.Array[Any]]] = {}
         for name, textures in _images(btf).items():
@@ -178,8 +208,40 @@ class _Job:
         """Note how many texels are masked, drop the journal and give the store its name."""
         masked = sum(entry["masked"] for entry in _journal(self.folder)[1:])
         zarr.open_group(self.folder, mode="r+", zarr_format=3).attrs["masked_texels"] = masked
-        (self.folder / _JOURNAL).unlink()
+        # The journal goes last: a run killed in between has nothing to do again.
         replace_folder(self.folder, final)
+        with suppress(FileNotFoundError):
+            (final / _JOURNAL).unlink()
+
+
+def _partial(final: Path) -> Path:
+    return final.with_name(f".{final.name}.partial")
+
+
+def _identity(btf: BTF, dtype: str) -> dict[str, Any]:
+    """What two runs must share for one to go on with the other's work, as JSON gives it back."""
+    identity = {
+        "dtype": dtype,
+        "shape": list(btf.shape),
+        "run": _run_length(btf, dtype),
+        "poses": _digest(btf.light, btf.view, btf.light_position, btf.view_position),
+        "attributes": _attributes(btf),
+    }
+    same: dict[str, Any] = json.loads(json.dumps(identity))
+    return same
+
+
+def _digest(*arrays: NDArray[Any] | None) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _begun(btf: BTF, final: Path, dtype: str) -> bool:
+    """Whether an earlier run has begun the same store."""
+    journal = _journal(_partial(final))
+    return bool(journal) and journal[0] == _identity(btf, dtype)
 
 
 def _images(btf: BTF) -> dict[str, Textures]:

@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.files import whole_folder
 from btfkit.io import archive, images, named
+from btfkit.io.archive import Archive
 from btfkit.textures import Array
 
 SUFFIXES = {".png", ".exr", ".jpg", ".jpeg"}
@@ -66,41 +68,48 @@ def read(
         rgb = pixels[..., :3]
         return colour.xyz_to_rgb(rgb) if values["exr_colour"] == "xyz" else rgb
 
+    moved: dict[str, Any] = {}
+
+    def relit(light: Array, view: Array) -> Array:
+        if light_shift is None:
+            return light
+        shifted, pairs = _shifted(light, view, Path(light_shift))
+        moved.update(light_shift=str(light_shift), light_shifted=pairs)
+        return shifted
+
     btf = named.read_named(
         path,
         decode,
         suffixes=SUFFIXES,
         cosine=values["cosine"],
+        relit=relit,
         provenance={"format": "utia", **record},
     )
-    return btf if light_shift is None else _shifted(btf, Path(light_shift))
+    return replace(btf, provenance={**btf.provenance, **moved})
 
 
-def _shifted(btf: BTF, table: Path) -> BTF:
-    """The BTF with the true lights of pairs whose nominal light and view coincide."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            rows = np.loadtxt(table, ndmin=2, comments=("#", "%"))
-    except (OSError, ValueError) as error:
-        raise FormatError(table, f"not a readable table of light shifts ({error})") from error
-    if rows.shape[1] != 5:
-        raise FormatError(
-            table, f"{rows.shape[1]} columns; expected number, theta, phi, theta_S, phi_S"
-        )
-    angles = np.radians(rows[:, 1:])
-    nominal = directions.from_angles(angles[:, 0], angles[:, 1])
-    real = directions.from_angles(angles[:, 2], angles[:, 3])
-    light = btf.light.copy()
-    coincide = np.flatnonzero(np.sum(btf.light * btf.view, axis=1) > 1 - 1e-6)
-    moved = 0
+def _shifted(light: Array, view: Array, table: Path) -> tuple[Array, list[int]]:
+    """(n, 3) true lights, and the pairs (whose nominal light and view coincide) that moved."""
+    table = table.resolve()
+    rows = Archive(table.parent).table(table.name, 5, comments="#%")
+    if (np.abs(rows[:, 1:]) > 360).any() or (rows[:, [1, 3]] < 0).any():
+        raise FormatError(table, "holds angles that are none; expected degrees")
+    theta, phi, theta_s, phi_s = np.radians(rows[:, 1:]).T
+    nominal, real = directions.from_angles(theta, phi), directions.from_angles(theta_s, phi_s)
+    shifted, moved = light.copy(), []
+    coincide = np.flatnonzero(np.sum(light * view, axis=1) > 1 - 1e-6)
     for pair in coincide:
-        match = np.flatnonzero(nominal @ btf.light[pair] > 1 - 1e-6)
+        match = np.flatnonzero(nominal @ light[pair] > 1 - 1e-6)
         if match.size:
-            light[pair] = real[match[0]]
-            moved += 1
-    provenance = {**btf.provenance, "light_shift": str(table), "light_shifted_pairs": moved}
-    return replace(btf, light=light, provenance=provenance)
+            shifted[pair] = real[match[0]]
+            moved.append(int(pair))
+    if len(moved) < len(coincide):
+        warnings.warn(
+            f"{table}: has no row for {len(coincide) - len(moved)} of {len(coincide)} pairs whose "
+            "light and view coincide",
+            stacklevel=4,
+        )
+    return shifted, moved
 
 
 def write(

@@ -19,6 +19,7 @@ from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.io import named
+from btfkit.io.merl import MOST
 from btfkit.textures import as_textures
 
 _THETAS, _PHIS = 6, 48
@@ -50,8 +51,12 @@ def read(path: Path, *, cosine: str | None = None, scale: float | None = None) -
         raise FormatError(path, f"{size} bytes; expected {_BYTES}", remedy="copy it again")
     stored = np.fromfile(path, "<f8").reshape(3, _THETAS, _PHIS, _THETAS, _PHIS)
     brdf = _merged(np.moveaxis(stored, 0, -1))
-    if not np.isfinite(brdf).any():
-        raise FormatError(path, "no value is finite and above 0")
+    if np.isnan(brdf).mean() > 0.5:
+        raise FormatError(
+            path,
+            f"{np.isnan(brdf).mean():.0%} of the values are negative, not finite or above {MOST:g}",
+            remedy="values must be float64, little-endian",
+        )
     table = directions.rings(_TABLE)
     light, view = np.repeat(table, len(table), axis=0), np.tile(table, (len(table), 1))
     quantity = np.pi * float(values["scale"]) * brdf.reshape(-1, 3)
@@ -74,7 +79,7 @@ def read(path: Path, *, cosine: str | None = None, scale: float | None = None) -
 
 def _merged(brdf: NDArray[np.float64]) -> NDArray[np.float64]:
     """(241, 241, 3) of (6, 48, 6, 48, 3): the azimuths of the poles as one, invalid ones NaN."""
-    usable = np.isfinite(brdf).all(axis=-1, keepdims=True) & (brdf >= 0).all(axis=-1, keepdims=True)
+    usable = ((brdf >= 0) & (brdf < MOST)).all(axis=-1, keepdims=True)
     brdf = np.where(usable, brdf, np.nan)
     with warnings.catch_warnings():
         # A pole of which nothing is valid stays NaN.
