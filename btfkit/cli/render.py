@@ -59,7 +59,7 @@ def render_verb(
     from btfkit.render import picture
     from btfkit.render.environment import Environment
     from btfkit.render.preview import Scene, render
-    from btfkit.render.shapes import shape_of
+    from btfkit.render.catalogue import shape_of
 
     w, h = size
     if min(size) < 1:

@@ -1,7 +1,7 @@
 """Shapes in closed form: where a ray meets them, and the frame, uv and curvature there.
 
-Object frame: right-handed, x right, y up, z towards a viewer at `view` 0,0. Every shape carries tiles
-that stand upright on the side that faces this viewer, u to the right and v down.
+Object frame: right-handed, x right, y up, z towards a viewer at `view` 0,0. Every shape carries
+tiles that stand upright on the side that faces this viewer, u to the right and v down.
 """
 
 from __future__ import annotations
@@ -33,18 +33,23 @@ class Surface(NamedTuple):
     """A shape at points of its surface.
 
     Attributes:
-        point: (m, 3) object frame. normal: (m, 3) unit, outwards.
+        point: (m, 3) object frame.
+        normal: (m, 3) unit, outwards; may be interpolated over the faces of a mesh.
+        flat: (m, 3) unit normal of the very surface, outwards.
         uv: (m, 2) tiles. du, dv: (m, 3) step of the point a tile in u and in v.
         bend: (m, 3) second fundamental form xx, xy, yy along unit x = du and y = normal x du,
             in 1/length, positive convex.
+        start: (m, 3) where rays towards lights start.
     """
 
     point: Floats
     normal: Floats
+    flat: Floats
     uv: Floats
     du: Floats
     dv: Floats
     bend: Floats
+    start: Floats
 
 
 class Shape(ABC):
@@ -93,18 +98,18 @@ class Plane(Shape):
             distance = -origin[:, 2] / direction[:, 2]
             at = origin[:, :2] + distance[:, None] * direction[:, :2]
             inside = (np.abs(at) <= self._half).all(axis=1) & (distance > beyond)
-        return _met(np.where(inside & np.isfinite(distance), distance, np.inf))
+        return met_once(np.where(inside & np.isfinite(distance), distance, np.inf))
 
     def surface(self, origin: Floats, direction: Floats, met: Meeting) -> Surface:
         point = origin + met.distance[:, None] * direction
         right, down = point[:, 0] + self._half[0], self._half[1] - point[:, 1]
         uv = np.stack([right / self.tile, down / self._tile_height], axis=1)
-        return Surface(
+        return exact(
             point,
-            _rows([0.0, 0.0, 1.0], len(point)),
+            alike([0.0, 0.0, 1.0], len(point)),
             uv,
-            _rows([self.tile, 0.0, 0.0], len(point)),
-            _rows([0.0, -self._tile_height, 0.0], len(point)),
+            alike([self.tile, 0.0, 0.0], len(point)),
+            alike([0.0, -self._tile_height, 0.0], len(point)),
             np.zeros((len(point), 3)),
         )
 
@@ -124,7 +129,9 @@ class Sphere(Shape):
 
     def meet(self, origin: Floats, direction: Floats, beyond: Floats) -> Meeting:
         along = np.einsum("ij,ij->i", origin, direction)
-        return _met(_nearest(_roots(1.0, along, np.einsum("ij,ij->i", origin, origin) - 1), beyond))
+        return met_once(
+            nearest(_roots(1.0, along, np.einsum("ij,ij->i", origin, origin) - 1), beyond)
+        )
 
     def surface(self, origin: Floats, direction: Floats, met: Meeting) -> Surface:
         point = origin + met.distance[:, None] * direction
@@ -139,9 +146,9 @@ class Sphere(Shape):
         uv = np.stack([0.5 + round_y / np.pi, polar / np.pi], axis=1) * (np.pi / self.tile)
         uv[:, 1] *= self._aspect
         du = east * np.maximum(radius, NEAR)[:, None] * self.tile
-        return Surface(
+        return exact(
             normal, normal, uv, du, south * (self.tile / self._aspect),
-            _rows([1.0, 0.0, 1.0], len(point)),
+            alike([1.0, 0.0, 1.0], len(point)),
         )  # fmt: skip
 
 
@@ -163,7 +170,7 @@ class Cylinder(Shape):
         with np.errstate(invalid="ignore"):
             height = origin[:, 1:2] + roots * direction[:, 1:2]
             roots = np.where(np.abs(height) <= self._half, roots, np.inf)
-        return _met(_nearest(roots, beyond))
+        return met_once(nearest(roots, beyond))
 
     def surface(self, origin: Floats, direction: Floats, met: Meeting) -> Surface:
         point = origin + met.distance[:, None] * direction
@@ -175,15 +182,24 @@ class Cylinder(Shape):
             axis=1,
         )
         du = np.stack([cos, 0 * sin, -sin], axis=1) * self.tile
-        dv = _rows([0.0, -self._tile_height, 0.0], len(point))
-        return Surface(point, normal, uv, du, dv, _rows([1.0, 0.0, 0.0], len(point)))
+        dv = alike([0.0, -self._tile_height, 0.0], len(point))
+        return exact(point, normal, uv, du, dv, alike([1.0, 0.0, 0.0], len(point)))
 
 
-def _met(distance: Floats) -> Meeting:
+def met_once(distance: Floats) -> Meeting:
+    """The meeting with a shape of one part."""
     return Meeting(distance, np.zeros(len(distance), np.intp))
 
 
-def _rows(vector: list[float], count: int) -> Floats:
+def exact(
+    point: Floats, normal: Floats, uv: Floats, du: Floats, dv: Floats, bend: Floats
+) -> Surface:
+    """A surface whose normals are its own."""
+    return Surface(point, normal, normal, uv, du, dv, bend, point)
+
+
+def alike(vector: list[float], count: int) -> Floats:
+    """One vector for `count` rows."""
     return np.broadcast_to(np.array(vector), (count, len(vector)))
 
 
@@ -197,28 +213,6 @@ def _roots(square: Floats | float, half_linear: Floats, constant: Floats) -> Flo
     return np.where(np.isfinite(roots), roots, np.inf)
 
 
-def _nearest(roots: Floats, beyond: Floats) -> Floats:
+def nearest(roots: Floats, beyond: Floats) -> Floats:
+    """(m,) least of the roots (m, k) that are beyond; inf where none is."""
     return np.where(roots > beyond[:, None], roots, np.inf).min(axis=1)
-
-
-SHAPES = ("plane", "sphere", "cylinder")
-
-
-def shape_of(name: str, *, repeat: int, aspect: float, picture: float) -> Shape:
-    """A shape by its name.
-
-    Args:
-        name: one of `SHAPES`.
-        repeat: tiles across its front. aspect: tile width / tile height.
-        picture: width / height of the picture, which a plane fills.
-
-    Raises:
-        ValueError: no such shape.
-    """
-    if name == "plane":
-        return Plane(repeat=repeat, aspect=aspect, picture=picture)
-    if name == "sphere":
-        return Sphere(repeat=repeat, aspect=aspect)
-    if name == "cylinder":
-        return Cylinder(repeat=repeat, aspect=aspect)
-    raise ValueError(f"no shape {name!r}; there are {', '.join(SHAPES)}")
