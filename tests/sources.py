@@ -12,7 +12,7 @@ import numpy as np
 
 from btfkit import directions
 from btfkit.btf import BTF
-from btfkit.io import images, manifest, store_write, ubo2003, utia
+from btfkit.io import bonn_header, bonn_pack, images, manifest, store_write, ubo2003, utia
 
 SIZE = (5, 7)
 PAIRS = 4
@@ -135,6 +135,20 @@ def _utia_brdf(folder: Path) -> Path:
     return folder / "m003_carpet01.bin"
 
 
+def _bonn(folder: Path) -> Path:
+    # Factors in quarters: their products are exact, in whatever order they are summed.
+    rng = np.random.default_rng(0)
+    left = rng.integers(-2, 3, (3 * PAIRS, 4)) / 4
+    right = rng.integers(-3, 4, (SIZE[0] * SIZE[1], 4)) / 4
+    angles = np.stack(directions.to_angles(directions.bonn81()[[8, 40]]), axis=-1)
+    with (folder / "wool.btf").open("wb") as file:
+        meta = bonn_header.Meta(version=4, setup="dome", ppmm=4.0, cosine=True)
+        file.write(bonn_pack.head(b"!FMF12FCER", meta, angles, angles, SIZE[::-1]))
+        file.write(bonn_pack.fmf_head(log=True, most=4))
+        bonn_pack.write_factors(file, left, np.ones(4), right, scalar=2)
+    return folder / "wool.btf"
+
+
 SOURCES: dict[str, Callable[[Path], Path]] = {
     "zarr": _zarr,
     "axf": _axf,
@@ -146,6 +160,7 @@ SOURCES: dict[str, Callable[[Path], Path]] = {
     "diligent": _diligent,
     "lp": _lp,
     "merl": _merl,
+    "bonn": _bonn,
     "utia_brdf": _utia_brdf,
 }
 # Folders of images: each may as well come as a zip.

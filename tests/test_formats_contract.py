@@ -16,7 +16,7 @@ import btfkit
 from btfkit import directions, io
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
-from btfkit.io import archive, images, manifest, store_write, ubo2003, utia
+from btfkit.io import archive, bonn_write, images, manifest, store_write, ubo2003, utia
 
 READABLE = [name for name in io.FORMATS if name != "axf"]
 # An EXR whose channels are wavelengths is still an EXR named by its angles.
@@ -209,6 +209,8 @@ WRITERS: dict[str, tuple[Callable[..., None], dict[str, object], float]] = {
     "utia half": (utia.write, {"exr": True}, 2**-10),
     "manifest": (manifest.write, {}, 0.0),
     "manifest half": (manifest.write, {"dtype": "float16"}, 2**-11),
+    # Logarithms down to -3 as sums of products of half numbers.
+    "bonn": (bonn_write.write, {}, 2**-9),
 }
 
 

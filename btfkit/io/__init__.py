@@ -28,6 +28,7 @@ FORMATS: dict[str, str] = {
     "diligent": "btfkit.io.diligent",
     "lp": "btfkit.io.lp",
     "merl": "btfkit.io.merl",
+    "bonn": "btfkit.io.bonn",
     "utia_brdf": "btfkit.io.utia_brdf",
 }
 
@@ -49,6 +50,9 @@ def detect(path: str | os.PathLike[str]) -> str:
     source = Path(path)
     if not source.exists():
         raise FileNotFoundError(f"{source}: no such file or folder")
+    if not (source.is_dir() or source.is_file()):
+        # A pipe or a device: who reads it may wait for ever.
+        raise FormatError(source, "is neither a file nor a folder")
     for name in FORMATS:
         if format_module(name).detect(source):
             return name
