@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import json
 import math
 import os
@@ -71,7 +72,7 @@ def verb(name: str, *, example: str) -> Callable[[Callable[..., Outcome]], click
             click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout."),
         ):
             call = option(call)
-        help_text = (function.__doc__ or "") + "\n\nExample:\n\n\b\n" + example
+        help_text = inspect.cleandoc(function.__doc__ or "") + "\n\nExample:\n\n\b\n" + example
         return click.command(name, help=help_text)(call)
 
     return decorate

@@ -2,32 +2,47 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from btfkit.cli.bar import Bar
 from btfkit.cli.options import NumbersType, force_option, out_option, seed_option, stem
-from btfkit.cli.outcome import Outcome, verb
+from btfkit.cli.outcome import Outcome, plain, verb
 
-_DIRECTION = NumbersType("THETA,PHI", float)
+if TYPE_CHECKING:
+    from btfkit.materials.base import Material
+    from btfkit.render.shapes import Floats
+
+_ANGLES = NumbersType("THETA,PHI", float)
+_LIGHT = (40.0, 45.0)
+_MOST_SIDE = 16384
 
 
 @verb(
     "render",
-    example="btfkit render wool.neumip.safetensors -o wool.png --shape sphere --light 40,45",
+    example="""btfkit render wool.neumip.safetensors -o wool.png --shape sphere --light 40,45
+btfkit render wool.btf.zarr -o wool.exr --shape torus --env hall.hdr --repeat 3""",
 )
 @click.argument("source", metavar="MODEL_OR_BTF", type=click.Path(path_type=Path))
-@out_option("*.png (sRGB) or *.exr (linear); by default the name of the source, .png, here")
-@click.option("--shape", default="plane", show_default=True, help="plane, sphere, cylinder.")
-@click.option("--light", "lights", type=_DIRECTION, multiple=True, help="Degrees; repeatable.")
+@out_option("*.png (sRGB) or *.exr (linear); by default the source's name with .png, here")
+@click.option("--shape", default="plane", show_default=True,
+              help="plane, sphere, cylinder, torus or FILE.obj.")  # fmt: skip
+@click.option("--light", "lights", type=_ANGLES, multiple=True,
+              help="Far away, degrees; repeatable. 40,45 where there is no --env.")  # fmt: skip
 @click.option("--env", type=click.Path(path_type=Path), help="Surroundings, *.hdr or *.exr.")
-@click.option("--view", type=_DIRECTION, default="0,0", show_default=True, help="Degrees.")
-@click.option("--repeat", type=click.IntRange(1, 1000), default=1, show_default=True, help="Tiles.")
+@click.option("--env-turn", type=float, default=0.0, help="Turn them about y, degrees.")
+@click.option("--view", type=_ANGLES, default="0,0", show_default=True, help="To the eye, degrees.")
+@click.option("--repeat", type=click.IntRange(1, 1000), default=1, show_default=True,
+              help="Tiles across the front of the shape.")  # fmt: skip
 @click.option("--size", type=NumbersType("WxH", int, "x"), default="512x512", show_default=True)
-@click.option("--spp", type=click.IntRange(1, 65536), help="Rays a pixel.")
+@click.option("--spp", type=click.IntRange(1, 65536), help="Rays a pixel; as needed by default.")
 @click.option("--exposure", type=float, default=0.0, show_default=True, help="Stops, PNG only.")
+@click.option("--background", type=NumbersType("R,G,B", float), default="0,0,0", show_default=True,
+              help="Linear, PNG only; an EXR has its cover as A.")  # fmt: skip
 @seed_option
 @force_option
 def render_verb(
@@ -38,55 +53,94 @@ def render_verb(
     shape: str,
     lights: tuple[tuple[float, float], ...],
     env: Path | None,
+    env_turn: float,
     view: tuple[float, float],
     repeat: int,
     size: tuple[int, int],
     spp: int | None,
     exposure: float,
+    background: tuple[float, float, float],
     seed: int,
     force: bool,
 ) -> Outcome:
-    """Draw a material on a shape.
+    """Draw a model, a BTF or a relief on a shape, seen from far away.
 
-    A white surface that faces one --light is 1. Directions are in the object's frame: x
-    right, y up, z towards the viewer; THETA from z, PHI from x towards y.
+    Angles are in the object's frame: x right, y up, z towards the viewer of --view 0,0; THETA from
+    z, PHI from x towards y. A white surface that faces one --light is 1. A plane fills the picture.
     """
-    import numpy as np
-
-    from btfkit import directions
-    from btfkit.cli.sources import material_of
     from btfkit.files import refuse_existing
     from btfkit.render import picture
-    from btfkit.render.environment import Environment
-    from btfkit.render.preview import Scene, render
     from btfkit.render.catalogue import shape_of
+    from btfkit.render.environment import Environment
+    from btfkit.render.preview import Scene, enough_samples, render
 
-    w, h = size
-    if min(size) < 1:
-        raise click.BadParameter(f"{w}x{h}; expected WxH, both positive", param_hint="--size")
+    start = time.perf_counter()
+    w, h = _checked_size(size)
     final = out or Path(stem(source) + ".png")
+    picture.check_name(final)
     refuse_existing(final, force=force)
-    material = material_of(source)
+    material = _material(source)
+    channels = material.header.channels
     if not lights and env is None:
-        lights = ((40.0, 45.0),)
+        lights = (_LIGHT,)
+    surroundings = None
+    if env is not None:
+        radiance = picture.read_surroundings(env, channels=channels)
+        surroundings = Environment(radiance, turn=math.radians(env_turn))
     scene = Scene(
         material,
         shape_of(shape, repeat=repeat, aspect=material.header.aspect, picture=w / h),
-        directions.from_angles(*np.radians(np.reshape(lights, (-1, 2))).T),
-        None if env is None else Environment(picture.read(env)),
+        _directions("--light", lights),
+        surroundings,
     )
-    start = time.perf_counter()
-    seen = render(
-        scene,
-        view=directions.from_angles(*np.radians(view)),
-        size=(h, w),
-        samples=spp or (1 if env is None else 64),
-        seed=seed,
-        progress=bar,
-    )
+    eye = _directions("--view", (view,))[0]
+    samples = spp or enough_samples(scene, eye, (h, w))
+    seen = render(scene, view=eye, size=(h, w), samples=samples, seed=seed, progress=bar)
+    about = {
+        "source": source, "model": material.model, "licence": material.header.licence,
+        "quantity": "radiance; 1 is a white diffuser that faces one light",
+        "shape": shape, "lights_deg": lights, "env": env, "env_turn_deg": env_turn,
+        "view_deg": view, "repeat": repeat, "spp": samples, "seed": seed,
+    }  # fmt: skip
+    picture.write(
+        seen, final, channels=channels, exposure=exposure, background=background,
+        about=plain(about), force=force,
+    )  # fmt: skip
     seconds = time.perf_counter() - start
-    picture.write(seen, final, channels=material.header.channels, exposure=exposure, force=force)
     return Outcome(
-        f"{final}: {w} x {h}, {seen.asked} queries, {seconds:.1f} s",
-        {"out": final, "queries": seen.asked, "seconds": seconds},
-    )
+        f"{final}: {w} x {h}, {samples} rays a pixel, {seen.asked} queries, {seconds:.1f} s",
+        {"out": final, "size": (w, h), "queries": seen.asked, "seconds": seconds,
+         "cover": float(seen.cover.mean()), **about},
+    )  # fmt: skip
+
+
+def _checked_size(size: tuple[int, int]) -> tuple[int, int]:
+    if not all(1 <= side <= _MOST_SIDE for side in size):
+        raise click.BadParameter(
+            f"{size[0]}x{size[1]}; expected sides of 1 to {_MOST_SIDE} pixels", param_hint="--size"
+        )
+    return size
+
+
+def _directions(option: str, angles: tuple[tuple[float, float], ...]) -> Floats:
+    """(n, 3) unit vectors of angles in degrees."""
+    import numpy as np
+
+    from btfkit.directions import from_angles
+
+    degrees = np.reshape(np.array(angles, float), (-1, 2))
+    if not np.isfinite(degrees).all():
+        raise click.BadParameter("expected finite angles in degrees", param_hint=option)
+    return from_angles(*np.radians(degrees).T)
+
+
+def _material(source: Path) -> Material:
+    """A model's or a BTF's material, or a relief that is traced."""
+    from btfkit.cli.sources import material_of
+
+    if source.suffix.lower() != ".exr":
+        return material_of(source)
+    from btfkit.relief.file import read
+    from btfkit.render.traced import TracedRelief
+
+    return TracedRelief(read(source))

@@ -1,0 +1,56 @@
+"""A relief as a material: the tracer answers, nothing is fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, final
+
+from btfkit.materials.base import Array, Header, Material
+from btfkit.queries import Query
+from btfkit.relief.relief import Relief
+from btfkit.relief.trace import SAMPLES, geometry, trace
+
+
+@final
+@dataclass(frozen=True)
+class TracedSpec:
+    """How a relief is traced.
+
+    Attributes:
+        samples: rays a query. bounces: interreflections. seed: of both.
+    """
+
+    samples: int = SAMPLES
+    bounces: int = 0
+    seed: int = 0
+
+
+@final
+class TracedRelief(Material):
+    """A relief on the plane; footprints are those of its own texels."""
+
+    model: ClassVar[str] = "relief"
+    spec_type: ClassVar[type] = TracedSpec
+    has_levels: ClassVar[bool] = True
+
+    def __init__(self, relief: Relief, spec: TracedSpec | None = None) -> None:
+        header = Header(
+            grid=relief.size,
+            channels=relief.channels,
+            wrap=relief.wrap,
+            texel_mm=relief.texel_mm,
+            provenance=dict(relief.provenance),
+        )
+        super().__init__(spec or TracedSpec(), {}, header)
+        self._geometry, self._has_holes = geometry(relief), relief.opacity is not None
+
+    @classmethod
+    def shapes(cls, spec: TracedSpec, header: Header) -> dict[str, tuple[int, ...]]:
+        return {}
+
+    def _answer(self, query: Query) -> tuple[Array, Array | None]:
+        spec = self.spec
+        traced = trace(
+            self._geometry, query, samples=spec.samples, bounces=spec.bounces, seed=spec.seed
+        )
+        return traced.rgb, traced.opacity if self._has_holes else None
