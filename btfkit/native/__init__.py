@@ -14,6 +14,7 @@ from types import ModuleType
 KERNELS: tuple[str, ...] = (
     "trace",
     "neumip",
+    "factors",
 )
 
 
