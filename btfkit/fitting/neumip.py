@@ -41,7 +41,8 @@ class Settings:
         features, coarse, light, offset: channels, as in `NeuMIPSpec`.
         width, offset_width: of the three hidden layers of each network.
         activation, offset_activation: "relu", "leaky" or "sine".
-        inputs: "xy" as published, "half" with the half vector beside it.
+        inputs: "xy" as published, "half" with the half vector beside it, "full" with all cosines,
+            the angle between the directions and the level of detail.
         output: "log", "relu" or "mask"; the published recipe has 3 or 6 `outputs` instead.
         outputs: of the published recipe: 3 as in its text, 6 as in its program.
         loss: "square" or "absolute", on log(1 + rgb).
@@ -62,14 +63,14 @@ class Settings:
     offset: int = 7
     width: int = 25
     offset_width: int = 25
-    activation: str = "sine"
+    activation: str = "leaky"
     offset_activation: str = "relu"
-    inputs: str = "xy"
+    inputs: str = "full"
     output: str = "log"
     outputs: int = 3
     loss: str = "square"
     batch: int = 0
-    rate: float = 3e-3
+    rate: float = 1e-2
     texture_rate: float = 1e-2
     beta2: float = 0.99
     omega: float = 1.0
@@ -124,8 +125,7 @@ class Settings:
 INPUTS: dict[str, tuple[str, ...]] = {
     "xy": ("lx", "ly", "vx", "vy"),
     "half": ("lx", "ly", "vx", "vy", "hx", "hy"),
-    "full": ("lx", "ly", "vx", "vy", "hx", "hy", "hz", "cos_diff"),
-    "z": ("lx", "ly", "lz", "vx", "vy", "vz", "hx", "hy"),
+    "full": ("lx", "ly", "lz", "vx", "vy", "vz", "hx", "hy", "hz", "cos_diff", "level"),
 }
 
 
@@ -304,7 +304,7 @@ class NeuMIP(_Trainable):
         loss = torch_loss(self.layout, weights, texels, batch, self.settings.loss)
         found = torch.autograd.grad(loss, (weights, texels))
         self._gradients = tuple(part.numpy() for part in found)
-        return float(loss)
+        return float(loss.detach())
 
     def _smooth(self, sigma: float) -> None:
         if sigma < 0.03:
@@ -375,7 +375,7 @@ class NeuMIPPaper(_Trainable):
             a = self._arrays
             slots = (a[name], a[f"{name}.first"], a[f"{name}.second"])
             adam_plain(slots, gradient.numpy(), 1e-3 * self._rate, self._steps, (0.9, 0.999))
-        return float(loss)
+        return float(loss.detach())
 
     def _loss(self, weights: Tensor, texels: Tensor, batch: Batch) -> Tensor:
         if self.spec.output != "released":
