@@ -12,6 +12,7 @@ TRAINED: dict[str, str] = {
 CLOSED_FORM: dict[str, str] = {
     "lambert": "btfkit.fitting.lambert:lambert",
     "interpolation": "btfkit.fitting.interpolation:interpolation",
+    "pca": "btfkit.fitting.pca:pca",
 }
 MODELS: dict[str, str] = {**CLOSED_FORM, **TRAINED}
 

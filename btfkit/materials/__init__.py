@@ -8,6 +8,7 @@ from typing import Any
 MODELS: dict[str, str] = {
     "lambert": "btfkit.materials.lambert:Lambert",
     "interpolation": "btfkit.materials.interpolation:Interpolation",
+    "pca": "btfkit.materials.pca:PCA",
     "neubtf": "btfkit.materials.neubtf:NeuBTF",
     "neumip": "btfkit.materials.neumip:NeuMIP",
     "neumip-paper": "btfkit.materials.neumip:NeuMIPPaper",

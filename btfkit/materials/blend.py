@@ -132,6 +132,9 @@ class Blend:
         light, view: (n, 3) unit vectors.
         lamps, eyes: where light and view come from, when that is near.
 
+    Attributes:
+        light: as given.
+
     Raises:
         ValueError: no pair is lit from above the horizon.
     """
@@ -139,7 +142,7 @@ class Blend:
     def __init__(
         self, light: Array, view: Array, *, lamps: Near | None = None, eyes: Near | None = None
     ) -> None:
-        self._lamps, self._eyes = lamps, eyes
+        self.light, self._lamps, self._eyes = light, lamps, eyes
         pairs = np.flatnonzero((light[:, 2] >= 0) & (view[:, 2] >= 0))
         if not pairs.size:
             raise ValueError(f"none of {len(light)} pairs is lit and seen from above the horizon")
