@@ -66,7 +66,7 @@ def side_of(flat: Floats, raw: Floats) -> Side:
         return Side(size, period, size, 0, 1.0)
     if not period:
         return Side(size, 0, size - overlap, overlap, 0.0)
-    tile = _longest(agreement, period)
+    tile = _longest(agreement, period, size)
     return Side(size, period, tile, min(size - tile, tile, _WIDEST), float(agreement[tile]))
 
 
@@ -125,8 +125,11 @@ def _period(agreement: Floats, chance: Floats) -> int:
     return int(peaks[agreement[peaks] >= _NEARLY * agreement[peaks].max()][0])
 
 
-def _longest(agreement: Floats, period: int) -> int:
-    """The largest whole number of periods over which the sample still agrees nearly best."""
+def _longest(agreement: Floats, period: int, size: int) -> int:
+    """The largest whole number of periods over which the sample still agrees nearly best.
+
+    Of at least half the sample, where there is one: a small tile repeats itself before the eye.
+    """
     found, exact, count = [period], float(period), 1
     while True:
         reach = max(1, round(0.1 * period))
@@ -137,8 +140,9 @@ def _longest(agreement: Floats, period: int) -> int:
         best = int(near[np.argmax(agreement[near])])
         count, exact = count + 1, float(best)
         found.append(best)
-    values = agreement[found]
-    return found[int(np.flatnonzero(values >= _NEARLY * values.max())[-1])]
+    large = [tile for tile in found if 2 * tile >= size] or found[-1:]
+    values = agreement[large]
+    return large[int(np.flatnonzero(values >= _NEARLY * values.max())[-1])]
 
 
 def _closes(raw: Floats, period: int) -> bool:

@@ -89,6 +89,10 @@ def spread_out(light: Floats, view: Floats, count: int) -> Sequence[int]:
     return [int(usable[i]) for i in chosen]
 
 
+def _missing(slices: Floats) -> Floats:
+    return np.where(np.isfinite(slices).any(axis=0), 0.0, 1.0)
+
+
 def _few_channels(image: Floats) -> list[Floats]:
     """At most three channels (h, w): of a spectrum, the means of its thirds."""
     c = image.shape[-1]
