@@ -34,8 +34,8 @@ def flip(answer: Array, truth: Array, *, pixels_per_degree: float = PIXELS_PER_D
     filtered = [_perceived(picture, pixels_per_degree) for picture in pictures]
     hunt = [_hunt(_to_lab(np.clip(_from_opponent(picture), 0, 1))) for picture in filtered]
     colour = _redistributed(_hyab(*hunt) ** _COLOUR_POWER)
-    luminances = [(picture[..., 0] + 16) / 116 for picture in pictures]
-    feature = _feature_difference(*luminances, pixels_per_degree)
+    ours, theirs = ((picture[..., 0] + 16) / 116 for picture in pictures)
+    feature = _feature_difference(ours, theirs, pixels_per_degree)
     return colour ** (1 - feature)
 
 

@@ -116,15 +116,17 @@ class NeuBTF(Material):
             z = self._normalised(layer, self._linear(f"renderer.{layer}", x))
             activation = np.sin(np.float32(self.spec.omega) * z)
             x = activation if layer == 0 else x + activation
-        return np.maximum(np.expm1(np.minimum(self._linear("renderer.out", x), _MOST_LOG)), 0)
+        logs = np.minimum(self._linear("renderer.out", x), np.float32(_MOST_LOG))
+        return np.maximum(np.expm1(logs), np.float32(0))
 
     def _shifted(self, uv: Array, view: Array) -> Array:
         """uv where the view ray meets the structure, by the predicted height along it."""
         inputs = np.concatenate([self._lookup(uv), view[:, :2]], axis=1)
         hidden = np.maximum(self._linear("parallax.0", inputs), 0)
         height = self._linear("parallax.1", hidden)
-        step = height * view[:, :2] / np.maximum(view[:, 2:], 0.6)
-        moved = uv + step * np.array([1, -self.header.aspect], np.float32)
+        step = height * view[:, :2] / np.maximum(view[:, 2:], np.float32(0.6))
+        axes = np.array([1, -self.header.aspect], np.float32)
+        moved = (uv + step * axes).astype(np.float32, copy=False)
         if self.header.wrap == "wrap":
             return moved - np.floor(moved)
         return np.clip(moved, 0, 1)
