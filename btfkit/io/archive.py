@@ -78,7 +78,8 @@ class Archive:
         ) as error:  # fmt: skip
             raise FormatError(
                 self.path,
-                f"member {name!r} cannot be unpacked ({error})",
+                # A damaged header is cited at length.
+                f"member {name[:100]!r} cannot be unpacked ({str(error)[:200]})",
                 remedy="copy the archive again",
             ) from error
         if len(data) != info.file_size:
@@ -191,7 +192,8 @@ class Archive:
             ) from error
         for info in members:
             name = PurePosixPath(info.filename.replace("\\", "/"))
-            if info.is_dir() or not _counts(name):
+            # ZipInfo.is_dir fails on an empty name.
+            if info.filename[-1:] in ("", "/") or not _counts(name):
                 continue
             if name.is_absolute() or ".." in name.parts or (name.parts and ":" in name.parts[0]):
                 raise FormatError(self.path, f"member {info.filename!r} would leave the archive")

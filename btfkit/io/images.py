@@ -126,7 +126,7 @@ def read_exr(name: str, data: bytes) -> tuple[Array, tuple[str, ...], dict[str, 
             raise FormatError(name, "the EXR is deep; expected flat pixels")
         check_size(name, spec.height, spec.width, spec.nchannels, coded=len(data))
         pixels = source.read_image(oiio.FLOAT)
-        fault = source.geterror()
+        fault = _fault(source.geterror)
         if pixels is None or fault:
             raise FormatError(name, f"the EXR cannot be decoded ({fault})", remedy="copy it again")
         values = _in_display_window(name, np.asarray(pixels, np.float32), spec, len(data))
@@ -150,13 +150,21 @@ def _with_exr(name: str, data: bytes, use: Callable[[Any], T]) -> T:
         file.flush()
         source = oiio.ImageInput.open(file.name)
         if source is None:
-            raise FormatError(name, f"the EXR cannot be opened ({oiio.geterror()})")
+            raise FormatError(name, f"the EXR cannot be opened ({_fault(oiio.geterror)})")
         try:
             return use(source)
         except UnicodeDecodeError as error:
             raise FormatError(name, "a name in the EXR is not UTF-8") from error
         finally:
             source.close()
+
+
+def _fault(said: Callable[[], str]) -> str:
+    """What the library says is wrong, in short: it cites a damaged file at length."""
+    try:
+        return " ".join(said().split())[:200]
+    except UnicodeDecodeError:
+        return "it holds names that are not UTF-8"
 
 
 def _in_display_window(name: str, pixels: Array, spec: Any, coded: int) -> Array:

@@ -196,7 +196,8 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _nested(value: dict[str, Any]) -> int:
     """Levels of lists and objects, counted no further than is too many."""
-    depth, level = 0, [value]
+    level: list[Any] = [value]
+    depth = 0
     while level and depth <= _MOST_NESTED:
         inner = (each.values() if isinstance(each, dict) else each for each in level)
         level = [item for each in inner for item in each if isinstance(item, (dict, list))]
