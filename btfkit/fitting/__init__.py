@@ -4,6 +4,8 @@ from __future__ import annotations
 
 # Models that are trained by steps: classes that implement `loop.Trainable`.
 TRAINED: dict[str, str] = {
+    "rainer19": "btfkit.fitting.rainer:Rainer19",
+    "rainer20": "btfkit.fitting.rainer:Rainer20",
     "neumip": "btfkit.fitting.neumip:NeuMIP",
     "neumip-paper": "btfkit.fitting.neumip:NeuMIPPaper",
     "neubtf": "btfkit.fitting.neubtf:NeuBTF",

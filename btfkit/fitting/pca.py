@@ -57,7 +57,7 @@ class Settings:
     error: float = 0.0
     layout: str = "joint"
     domain: str = "log"
-    floor: float = 0.1
+    floor: float = 1.0
     passes: int = 4
     memory_mb: int = 1024
 

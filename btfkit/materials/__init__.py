@@ -9,6 +9,8 @@ MODELS: dict[str, str] = {
     "lambert": "btfkit.materials.lambert:Lambert",
     "interpolation": "btfkit.materials.interpolation:Interpolation",
     "pca": "btfkit.materials.pca:PCA",
+    "rainer19": "btfkit.materials.rainer:Rainer19",
+    "rainer20": "btfkit.materials.rainer:Rainer20",
     "neubtf": "btfkit.materials.neubtf:NeuBTF",
     "neumip": "btfkit.materials.neumip:NeuMIP",
     "neumip-paper": "btfkit.materials.neumip:NeuMIPPaper",

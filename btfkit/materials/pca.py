@@ -44,7 +44,7 @@ class PCASpec:
     channels: int
     ranks: tuple[int, ...]
     domain: Domain = "log"
-    floor: float = 0.1
+    floor: float = 1.0
     positions: tuple[str, ...] = ()
 
 
