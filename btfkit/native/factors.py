@@ -74,7 +74,9 @@ def images_plain(
         wanted = right[first : last + 1]
     else:
         wanted = right[texels]
-    product = left[rows.reshape(-1)].astype(np.float32) @ wanted.astype(np.float32, copy=False).T
+    with np.errstate(over="ignore", invalid="ignore"):
+        a = left[rows.reshape(-1)].astype(np.float32)
+        product = a @ wanted.astype(np.float32, copy=False).T
     product = _finished(product.reshape(b, c, -1), log, scale[:, None, None])
     out[...] = product.transpose(0, 2, 1).reshape(out.shape)
 
@@ -109,8 +111,9 @@ def values_plain(
     out = np.empty(len(i), np.float32)
     for start in range(0, len(i), 4096):
         part = slice(start, start + 4096)
-        a, b = left[i[part]].astype(np.float32), right[j[part]].astype(np.float32)
-        out[part] = np.einsum("ik,ik->i", a, b)
+        with np.errstate(over="ignore", invalid="ignore"):
+            a, b = left[i[part]].astype(np.float32), right[j[part]].astype(np.float32)
+            out[part] = np.einsum("ik,ik->i", a, b)
     return _finished(out, log, scale)
 
 
