@@ -75,9 +75,9 @@ def _perceived(picture: Array, pixels_per_degree: float) -> Array:
         total = 0.0
         filtered = np.zeros(picture.shape[:2])
         for a, b in terms:
-            # sqrt(pi / b)^2 belongs to the two-dimensional kernel: one factor an axis.
+            # The paper's weights, sqrt(pi / b), though the kernel has two dimensions.
             line = np.exp(-(np.pi**2) * degrees**2 / b)
-            weight = a * np.pi / b
+            weight = a * np.sqrt(np.pi / b)
             total += weight * line.sum() ** 2
             filtered += weight * _separable(picture[..., channel], line, line)
         out[..., channel] = filtered / total
