@@ -19,7 +19,7 @@ Array = NDArray[np.float32]
 Index = NDArray[np.intp]
 
 # Images in work, bytes.
-_AT_ONCE = 1 << 26
+_AT_ONCE = 1 << 25
 # Images that the axes of PCA are found from.
 _SAMPLE = 32
 _OF_RGB = (1, 2, 3, 4, 9, 10, 11)
