@@ -153,14 +153,16 @@ def seam_ratio(image: Array) -> float:
     """Mean |step| across the seams of a tiled picture over that inside; near 1 where it tiles.
 
     Args:
-        image: (h, w, c) one tile.
+        image: (h, w, c) one tile; steps to NaN do not count.
     """
     ratios = []
     for axis in (0, 1):
         x = np.moveaxis(np.asarray(image, np.float64), axis, 0)
         if len(x) < 2:
             continue
-        across = np.abs(x[0] - x[-1]).mean()
-        inside = np.abs(np.diff(x, axis=0)).mean()
+        across, inside = (
+            float(step[np.isfinite(step)].mean()) if np.isfinite(step).any() else 0.0
+            for step in (np.abs(x[0] - x[-1]), np.abs(np.diff(x, axis=0)))
+        )
         ratios.append(1.0 if across == inside == 0 else across / max(inside, 1e-12))
     return float(np.mean(ratios)) if ratios else 1.0

@@ -87,9 +87,11 @@ class Drift:
 
 
 def _waves(length: int, period: int) -> Floats:
-    """(2 waves + 1, length) the constant, and cosine and sine of each wave."""
+    """(2 waves + 1, length) the constant, and cosine and sine of each wave the period can hold."""
     phase = 2 * np.pi * np.arange(length) / period
-    pairs = [f(k * phase) for k in range(1, _WAVES + 1) for f in (np.cos, np.sin)]
+    pairs = [
+        (2 * k < period) * f(k * phase) for k in range(1, _WAVES + 1) for f in (np.cos, np.sin)
+    ]
     return np.stack([np.ones(length), *pairs])
 
 
@@ -125,8 +127,8 @@ def _step(near: Floats, far: Floats, waves: Floats, floor: Floats) -> Floats:
     lit = floor > 0
     means = [np.maximum(total / weight, np.where(lit, floor, 1.0)) for total in sums]
     step = np.where(lit, np.log(means[1]) - np.log(means[0]), 0.0)
-    norms = np.square(waves).sum(axis=1, keepdims=True)
-    return waves @ step / norms
+    # A wave that the side cannot hold is 0 all over.
+    return waves @ step / np.maximum(np.square(waves).sum(axis=1, keepdims=True), 1.0)
 
 
 def _low(values: Floats) -> Floats:

@@ -186,9 +186,9 @@ def _joined(summary: Summary, rows: Side, cols: Side) -> IndexMap:
         cut = (open_cut if rows.overlap else closed_cut)(*(part.T for part in parts))
         far = np.arange(cols.tile) < cut[:, None]
         col = col + cols.tile * far
-    if not rows.overlap:
-        return IndexMap(rows.start + row - row[0], col, (rows.size, cols.size))
     whole = np.broadcast_to(row, col.shape)
+    if not rows.overlap:
+        return IndexMap(whole, col, (rows.size, cols.size))
     near, far = ((whole[part], col[part]) for part in _bands(rows))
     lean = _lean(summary, near, far, rows.tile)
     far = far[0], np.roll(far[1], -lean, axis=1)
