@@ -30,6 +30,10 @@ from btfkit.native.neumip import Array, Kernel, Layout, Network, available
 from btfkit.queries import QuerySet
 
 
+# Direction pairs for which a decay of 1 is right; docs/neumip.md has the measurements.
+_DECAY_PAIRS = 60
+
+
 @final
 @dataclass(frozen=True)
 class Settings:
@@ -48,6 +52,8 @@ class Settings:
         loss: "square" or "absolute", on log(1 + rgb).
         batch: queries a step; 0: by the size of the texture.
         rate, texture_rate: peak learning rates. beta2: of Adam.
+        decay: of the weights a unit of learning rate, for few direction pairs: divided by how many
+            times 60 of them there are. Queries each have a pair of their own, and next to none.
         omega: factor on the first layers' initial weights where they end in sines.
         smooth: texels of blur a pass while training begins; it halves nine times in a run.
         precision: of the saved textures: float32, float16 or int8.
@@ -73,6 +79,7 @@ class Settings:
     rate: float = 1e-2
     texture_rate: float = 1e-2
     beta2: float = 0.99
+    decay: float = 1.0
     omega: float = 1.0
     smooth: float = 0.0
     precision: str = "float16"
@@ -116,7 +123,7 @@ class Settings:
             ("levels", 0, 16), ("size", 0, 1 << 14), ("features", 1, 8), ("coarse", 0, 8),
             ("light", 0, 8), ("offset", 0, 8), ("width", 1, 128), ("offset_width", 1, 128),
             ("batch", 0, 1 << 24), ("pool_mb", 1, 1 << 24), ("rate", 0, 1), ("texture_rate", 0, 1),
-            ("beta2", 0, 0.999999), ("omega", 0, 1000), ("smooth", 0, 1),
+            ("beta2", 0, 0.999999), ("decay", 0, 100), ("omega", 0, 1000), ("smooth", 0, 1),
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"{name} = {getattr(self, name)}; expected {low} to {high}")
@@ -161,6 +168,7 @@ class _Trainable(Trainable, ABC):
             self._source = RowSource(source, train, test, seed=generators.seed)
         self.masked = self._source.masked
         self._held = self._source.held_out()
+        self._decay = s.decay * min(1.0, _DECAY_PAIRS / max(len(train), 1))
         self._steps, self._rate = 0, 1.0
         self._arrays = self._initial(generators.numpy)
 
@@ -279,6 +287,8 @@ class NeuMIP(_Trainable):
         else:
             for slots, rate, grown in zip(parameters, rates, self._gradients, strict=True):
                 adam_plain(slots, grown, rate, self._steps, (0.9, s.beta2), dense=dense)
+        # Few directions say little about those between: small weights bend little.
+        arrays["weights"] *= np.float32(1 - rates[0] * self._decay)
         if s.smooth and self._steps % 16 == 0:
             self._smooth(s.smooth * 2 ** (-9 * progress))
         return loss
