@@ -31,14 +31,20 @@ constexpr float kLowest = -104.0f, kHighest = 89.0f;  // beyond them exp is 0 an
 
 // Whole images: out (images, texels, channels), rows of `left` packed in groups.
 struct Images {
-    const float* left;     // (groups, k, rows)
+    const float* left;     // groups of rows, each (k, rows of the group)
     const uint8_t* right;  // (.., k) numbers
     const int64_t *down, *along;
     const float* scale;    // a row of left, padded
-    int64_t k, images, channels, texels, width;
+    int64_t k, rows, images, channels, texels, width;
     bool log;
     float* out;
 };
+
+// Rows of the last group where the others have `most`: what is left, rounded up to 3, 6 or 12.
+inline int64_t rest(int64_t rows, int64_t most) {
+    const int64_t left = rows % most;
+    return left == 0 ? 0 : left <= 3 ? 3 : left <= 6 ? 6 : 12;
+}
 
 struct Values {
     const uint8_t *left, *right;
@@ -217,15 +223,17 @@ void images(Bytes left, int64_t left_k, int left_size, Bytes right, int64_t righ
     require(*y.first + *x.first >= 0 && *y.second + *x.second < b.rows, "a texel outside the right factor");
 
     nb::gil_scoped_release release;
-    const int64_t all = count * channels, groups = (all + run.rows - 1) / run.rows;
-    std::vector<float> packed(size_t(groups * run.rows * a.k)), scales(size_t(groups * run.rows));
+    const int64_t all = count * channels, whole = all / run.rows * run.rows;
+    const int64_t last = factors::rest(all, run.rows);
+    std::vector<float> packed(size_t((whole + last) * a.k)), scales(size_t(whole + last));
     for (int64_t r = 0; r < all; ++r) {
         scales[r] = scale.data()[r / channels];
-        float* to = packed.data() + r / run.rows * run.rows * a.k + r % run.rows;
-        for (int64_t i = 0; i < a.k; ++i) to[i * run.rows] = number(a, rows.data()[r], i);
+        const int64_t wide = r < whole ? run.rows : last, start = r / run.rows * run.rows;
+        float* to = packed.data() + start * a.k + r - start;
+        for (int64_t i = 0; i < a.k; ++i) to[i * wide] = number(a, rows.data()[r], i);
     }
     const int64_t texels = int64_t(down.size() * along.size());
-    const factors::Images job{packed.data(), b.data, down.data(), along.data(), scales.data(), a.k,
+    const factors::Images job{packed.data(), b.data, down.data(), along.data(), scales.data(), a.k, all,
                               count, channels, texels, int64_t(along.size()), log, out.data()};
     std::atomic<int64_t> next{0};
     // A thread is worth starting for a millisecond's work.

@@ -1,7 +1,7 @@
 // One variant of the kernel, included once for each width of vectors. Twin: factors.py.
 //
-// Lanes are texels: a tile of 2 x LANES rows of `right` is turned to (k, texels), and ROWS rows of
-// `left` are multiplied with it at a time. Every value is the same chain of multiply-adds over k,
+// Lanes are texels: a tile of 2 x LANES rows of `right` is turned to (k, texels), and 12 rows of
+// `left`, or 6, or 3, are multiplied with it at a time. Every value is the same chain of multiply-adds over k,
 // wherever in a tile it lies, so that windows and scattered values are those of whole images.
 
 namespace factors::FACTORS_SPACE {
@@ -210,14 +210,15 @@ FACTORS_TARGET static void pack(const uint8_t* const* rows, int64_t k, float* ou
         }
 }
 
-// kRows images' rows (k, kRows) times texels (k, kTile), finished: (kRows, kTile).
-FACTORS_INLINE void multiply(const float* a, const float* b, int64_t k, V (&sum)[kRows][2]) {
+// ROWS rows of images (k, ROWS) times texels (k, kTile): (ROWS, kTile).
+template <int ROWS>
+FACTORS_INLINE void multiply(const float* a, const float* b, int64_t k, V (&sum)[ROWS][2]) {
 #pragma GCC unroll 16
-    for (int r = 0; r < kRows; ++r) sum[r][0] = sum[r][1] = all(0.0f);
-    for (int64_t i = 0; i < k; ++i, a += kRows, b += kTile) {
+    for (int r = 0; r < ROWS; ++r) sum[r][0] = sum[r][1] = all(0.0f);
+    for (int64_t i = 0; i < k; ++i, a += ROWS, b += kTile) {
         const V left = load(b), right = load(b + kLanes);
 #pragma GCC unroll 16
-        for (int r = 0; r < kRows; ++r) {
+        for (int r = 0; r < ROWS; ++r) {
             const V x = all(a[r]);
             sum[r][0] = fma(x, left, sum[r][0]);
             sum[r][1] = fma(x, right, sum[r][1]);
@@ -225,18 +226,19 @@ FACTORS_INLINE void multiply(const float* a, const float* b, int64_t k, V (&sum)
     }
 }
 
-// Where group `group` of rows goes, for texels first .. first + count of every image.
-FACTORS_INLINE void deliver(const Images& job, int64_t group, int64_t first, int64_t count, V (&sum)[kRows][2]) {
-    const int64_t c = job.channels, start = group * kRows;
+// Finish rows start .. start + ROWS and put texels first .. first + count of them into images.
+template <int ROWS>
+FACTORS_INLINE void deliver(const Images& job, int64_t start, int64_t first, int64_t count, V (&sum)[ROWS][2]) {
+    const int64_t c = job.channels;
     const float* scale = job.scale + start;
 #pragma GCC unroll 16
-    for (int r = 0; r < kRows; ++r)
+    for (int r = 0; r < ROWS; ++r)
 #pragma GCC unroll 2
         for (int half = 0; half < 2; ++half) sum[r][half] = finished(sum[r][half], all(scale[r]), job.log);
     float spare[3 * kTile];
     if (c == 3) {
 #pragma GCC unroll 8
-        for (int r = 0; r < kRows; r += 3) {
+        for (int r = 0; r < ROWS; r += 3) {
             const int64_t image = (start + r) / 3;
             if (image >= job.images) return;
             float* out = job.out + (image * job.texels + first) * 3;
@@ -248,7 +250,7 @@ FACTORS_INLINE void deliver(const Images& job, int64_t group, int64_t first, int
         return;
     }
 #pragma GCC unroll 16
-    for (int r = 0; r < kRows; ++r) {
+    for (int r = 0; r < ROWS; ++r) {
         const int64_t image = (start + r) / c, channel = (start + r) % c;
         if (image >= job.images) return;
         float* out = job.out + (image * job.texels + first) * c + channel;
@@ -258,6 +260,13 @@ FACTORS_INLINE void deliver(const Images& job, int64_t group, int64_t first, int
         if (to == spare)
             for (int64_t i = 0; i < count; ++i) out[i * c] = spare[i];
     }
+}
+
+template <int ROWS>
+FACTORS_INLINE void group(const Images& job, int64_t start, int64_t first, int64_t count, const float* packed) {
+    V sum[ROWS][2];
+    multiply<ROWS>(job.left + start * job.k, packed, job.k, sum);
+    deliver<ROWS>(job, start, first, count, sum);
 }
 
 template <class T>
@@ -271,10 +280,13 @@ FACTORS_TARGET static void images(const Images& job, std::atomic<int64_t>& next,
             rows[i] = job.right + (job.down[texel / job.width] + job.along[texel % job.width]) * k * int64_t(sizeof(T));
         }
         pack<T>(rows, k, packed);
-        for (int64_t group = 0; group * kRows < job.images * job.channels; ++group) {
-            V sum[kRows][2];
-            multiply(job.left + group * kRows * k, packed, k, sum);
-            deliver(job, group, first, count, sum);
+        const int64_t whole = job.rows / kRows * kRows;
+        for (int64_t start = 0; start < whole; start += kRows) group<kRows>(job, start, first, count, packed);
+        switch (rest(job.rows, kRows)) {
+            case 3: group<3>(job, whole, first, count, packed); break;
+            case 6: group<6>(job, whole, first, count, packed); break;
+            case 12: group<12>(job, whole, first, count, packed); break;
+            default: break;
         }
     }
 }
