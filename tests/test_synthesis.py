@@ -690,16 +690,15 @@ def test_a_store_becomes_a_store_of_the_same_depth(
 
 
 def test_a_store_at_the_end_of_float16_becomes_a_deeper_one(tmp_path: Path) -> None:
-    btf = measured()
-    high = replace(btf, textures=np.stack([btf.texture(i) for i in range(6)]) * 5.9e4 / 1.3)
-    largest = max(float(high.texture(i).max()) for i in range(6))
-    high = replace(high, textures=np.stack([high.texture(i) for i in range(6)]) * 5.9e4 / largest)
+    values = np.stack([measured().texture(i) for i in range(6)])
+    high = replace(measured(), textures=values * (5.9e4 / values.max()))
     store_write.write(high, tmp_path / "a.btf.zarr", dtype="float16")
-    top = max(float(tile_btf(high)[0].texture(i).max()) for i in range(6))
+    # The premise: taking drift away lifts a value over the end.
+    assert max(float(tile_btf(high)[0].texture(i).max()) for i in range(6)) > 6e4
     assert call("tile", tmp_path / "a.btf.zarr", "-o", tmp_path / "b.btf.zarr") == 0
     textures = store.read(tmp_path / "b.btf.zarr").textures
     assert isinstance(textures, store.StoreTextures)
-    assert textures.dtype == (np.float32 if top > 6e4 else np.float16)
+    assert textures.dtype == np.float32
 
 
 def test_a_model_becomes_a_model_without_its_encoder(
