@@ -690,11 +690,14 @@ def test_a_store_becomes_a_store_of_the_same_depth(
 
 
 def test_a_store_at_the_end_of_float16_becomes_a_deeper_one(tmp_path: Path) -> None:
-    values = np.stack([measured().texture(i) for i in range(6)])
-    high = replace(measured(), textures=values * (5.9e4 / values.max()))
+    values = (grains(200, 200, seed=8)[:70, :83] * shading(70, 83)).repeat(3, axis=2)
+    # A glint where it is dark: there the gain is above 1.
+    values[33:36, 20:23] = values.max()
+    up = np.array([[0, 0, 1.0]])
+    high = BTF(values[None] * (5.9e4 / values.max()), up, up)
     store_write.write(high, tmp_path / "a.btf.zarr", dtype="float16")
     # The premise: taking drift away lifts a value over the end.
-    assert max(float(tile_btf(high)[0].texture(i).max()) for i in range(6)) > 6e4
+    assert tile_btf(high)[0].texture(0).max() > 6e4
     assert call("tile", tmp_path / "a.btf.zarr", "-o", tmp_path / "b.btf.zarr") == 0
     textures = store.read(tmp_path / "b.btf.zarr").textures
     assert isinstance(textures, store.StoreTextures)
