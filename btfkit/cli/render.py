@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 _ANGLES = NumbersType("THETA,PHI", float)
 _LIGHT = (40.0, 45.0)
 _MOST_SIDE = 16384
+# Bytes of a BTF that is read as a whole.
+_IN_MEMORY = 1 << 30
 
 
 @verb(
@@ -80,6 +82,9 @@ def render_verb(
     picture.check_name(final)
     refuse_existing(final, force=force)
     material = _material(source)
+    if env is not None or shape != "plane":
+        # Such a picture needs most of the textures anyway.
+        material = _at_hand(material)
     channels = material.header.channels
     if not lights and env is None:
         lights = (_LIGHT,)
@@ -136,11 +141,28 @@ def _directions(option: str, angles: tuple[tuple[float, float], ...]) -> Floats:
 
 def _material(source: Path) -> Material:
     """A model's or a BTF's material, or a relief that is traced."""
-    from btfkit.cli.sources import material_of
+    import btfkit
 
-    if source.suffix.lower() != ".exr":
-        return material_of(source)
-    from btfkit.relief.file import read
-    from btfkit.render.traced import TracedRelief
+    if source.suffix.lower() == ".exr":
+        from btfkit.relief.file import read
+        from btfkit.render.traced import TracedRelief
 
-    return TracedRelief(read(source))
+        return TracedRelief(read(source))
+    if source.suffix == ".safetensors":
+        return btfkit.load(source)
+    from btfkit.materials.interpolation import Interpolation
+
+    return Interpolation.of(btfkit.open(source))
+
+
+def _at_hand(material: Material) -> Material:
+    """The same material, in memory where it is a small BTF."""
+    import numpy as np
+
+    from btfkit.materials.interpolation import Interpolation
+
+    lazy: Any = material.weights.get("texture")
+    if not isinstance(material, Interpolation) or 4 * math.prod(lazy.shape) > _IN_MEMORY:
+        return material
+    texture = lazy.batch(np.arange(len(lazy)))
+    return Interpolation(material.spec, {**material.weights, "texture": texture}, material.header)

@@ -21,8 +21,9 @@ from btfkit.render.shadows import Shadows
 from btfkit.render.shapes import NEAR, Floats, Meeting, Plane, Shape, Surface
 
 Ints = NDArray[np.intp]
-# Rays traced at once; sheets that a ray may pass; the share of light not worth following.
-_BLOCK, _MOST_SHEETS, _NOTHING = 1 << 15, 64, 1e-3
+# Rays traced at once: many, since a lazy BTF decodes its textures anew for each block. Sheets that
+# a ray may pass. The share of light not worth following.
+_BLOCK, _MOST_SHEETS, _NOTHING = 1 << 18, 64, 1e-3
 
 
 @final
