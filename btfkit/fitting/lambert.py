@@ -97,9 +97,9 @@ def _of_queries(queries: QuerySet) -> tuple[Sums, Header]:
         weight = weight * (rows.opacity > 0)
     cosine = rows.light[:, 2].astype(float)
     values: NDArray[np.float32] = rows.rgb  # type: ignore[assignment]
-    product = np.stack(
-        [np.bincount(texel, weight * cosine * v, h * w) for v in values.T.astype(float)], axis=-1
-    ).reshape(h, w, -1)
-    square = np.bincount(texel, weight * np.square(cosine), h * w).reshape(h, w, 1)
-    header = Header(grid=(h, w), channels=queries.channels)
-    return (product, np.broadcast_to(square, product.shape)), header
+    product = np.empty((h, w, values.shape[1]))
+    for k, value in enumerate(values.T.astype(float)):
+        product[..., k] = np.bincount(texel, weight * cosine * value, h * w).reshape(h, w)
+    square = np.empty_like(product)
+    square[:] = np.bincount(texel, weight * np.square(cosine), h * w).reshape(h, w, 1)
+    return (product, square), Header(grid=(h, w), channels=queries.channels)

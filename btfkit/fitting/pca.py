@@ -90,7 +90,9 @@ def pca(
     btf = images_of(source, "pca")
     rows = Rows(btf, s.domain, s.floor, memory=s.memory_mb << 20)  # type: ignore[arg-type]
     n, h, w, c = btf.shape
-    groups = [tuple(range(c))] if s.layout == "joint" else [(k,) for k in range(c)]
+    groups: list[tuple[int, ...]] = [tuple(range(c))]
+    if s.layout == "channels":
+        groups = [(k,) for k in range(c)]
     most = [min(n * len(group), h * w) for group in groups]
     wanted, budget = _asked(s, btf, groups, most)
     found = []
@@ -307,7 +309,7 @@ def _filled(block: Floats, basis: Floats | None) -> Floats:
     number = np.maximum((~missing).sum(axis=1, keepdims=True), 1)
     mean = np.where(missing, 0, block).sum(axis=1, keepdims=True) / number
     filled = np.where(missing, mean, block).astype(np.float32)
-    for _ in range(_FILLS if basis is not None else 0):
-        predicted = (filled @ basis) @ basis.T  # type: ignore[union-attr]
-        filled = np.where(missing, predicted, block)
+    if basis is not None:
+        for _ in range(_FILLS):
+            filled = np.where(missing, (filled @ basis) @ basis.T, block)
     return filled

@@ -56,7 +56,7 @@ class Settings:
 
     latents: int = 0
     pairs: int = 32
-    texels: int = 256
+    texels: int = 32
     probes: int = 256
     subset: int = 64
     rate: float = 2e-3

@@ -71,9 +71,8 @@ class Samples:
         number = measured.sum(axis=axis, keepdims=True)
         total = np.where(measured, values, 0).astype(np.float32)
         everywhere = total.sum() / max(measured.sum(), 1)
-        mean = np.where(
-            number > 0, total.sum(axis, keepdims=True) / np.maximum(number, 1), everywhere
-        )
+        mean = total.sum(axis, keepdims=True) / np.maximum(number, 1)
+        mean = np.where(number > 0, mean, everywhere)
         square = np.square(np.where(measured, values - mean, 0)).sum(axis, keepdims=True)
         deviation = np.sqrt(square / np.maximum(number, 1))
         if not by_texel:

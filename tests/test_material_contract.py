@@ -1,0 +1,270 @@
+"""The laws that every model keeps, whatever fitted it. A new model adds a line to TINY."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import btfkit
+from btfkit import materials
+from btfkit.btf import BTF
+from btfkit.fitting import CLOSED_FORM, MODELS
+from btfkit.fitting.fit import fit
+from btfkit.materials.base import Material
+from btfkit.materials.evaluation import answer_pair
+from btfkit.relief.synth import synth_btf
+
+# Steps and settings with which a model is fitted in about a second.
+TINY: dict[str, tuple[int, dict[str, str]]] = {
+    "lambert": (1, {}),
+    "interpolation": (1, {}),
+    "pca": (1, {"rank": "8"}),
+    "rainer19": (200, {"pairs": "16", "texels": "32", "rate": "5e-3"}),
+    "rainer20": (200, {"pairs": "16", "texels": "32", "subset": "16", "rate": "5e-3"}),
+    "neumip": (150, {"batch": "1024", "levels": "1"}),
+    "neumip-paper": (150, {"batch": "1024", "levels": "1"}),
+    "neubtf": (150, {"pairs": "8", "texels": "64", "encoder": "false"}),
+}
+FULL_SPHERE = {name for name in MODELS if materials.material_class(name).full_sphere}
+every_model = pytest.mark.parametrize("model", sorted(MODELS))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """Fits as small as these would spend their time in handing work from thread to thread."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("BTFKIT_THREADS", "1")
+        yield
+
+
+@cache
+def tiny() -> BTF:
+    """63 pairs of 16 x 16 texels, in memory."""
+    lazy = synth_btf("knit", size=16, lights="9", views="7", samples=4)
+    return replace(lazy, textures=lazy.textures.batch(range(len(lazy))), wrap="wrap")
+
+
+def fitted_to(btf: BTF, model: str, **options: Any) -> Material:
+    steps, settings = TINY[model]
+    report = fit(btf, model=model, steps=steps, settings=settings, device="cpu", **options)
+    return report.material
+
+
+@cache
+def fitted(model: str) -> Material:
+    return fitted_to(tiny(), model)
+
+
+def upper(rng: np.random.Generator, count: int) -> np.ndarray:
+    direction = rng.normal(size=(count, 3))
+    direction[:, 2] = np.abs(direction[:, 2]) + 0.05
+    return direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+
+def test_every_model_is_in_the_contract() -> None:
+    assert set(TINY) == set(MODELS)
+    assert set(MODELS) <= set(materials.MODELS)
+
+
+@every_model
+def test_a_model_says_what_it_is_of(model: str) -> None:
+    material, btf = fitted(model), tiny()
+    assert material.model == model
+    assert isinstance(material, materials.material_class(model))
+    assert material.header.grid == btf.shape[1:3]
+    assert material.header.channels == btf.channels
+    assert material.header.wrap == "wrap"
+    assert material.header.steps >= 1
+
+
+@every_model
+def test_shapes_broadcast(model: str) -> None:
+    rng = np.random.default_rng(1)
+    uv, view = rng.random((4, 1, 2)), upper(rng, 5)
+    rgb, opacity = fitted(model).evaluate(uv, [0.3, 0.1, 0.9], view)
+    assert rgb.shape == (4, 5, 3)
+    assert rgb.dtype == np.float32
+    assert opacity.shape == (4, 5)
+    one = fitted(model).evaluate(uv[2, 0], [0.3, 0.1, 0.9], view[3])
+    # float32, and matrix products may add in another order for one row than for twenty
+    np.testing.assert_allclose(one.reflectance, rgb[2, 3], atol=2e-5)
+    assert fitted(model).evaluate(np.zeros((0, 2)), [0, 0, 1], [0, 0, 1])[0].shape == (0, 3)
+
+
+@every_model
+def test_save_and_load_give_the_same_answers(model: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    queries = rng.random((200, 2)), upper(rng, 200), upper(rng, 200)
+    btfkit.materials.file.save(fitted(model), tmp_path / "m.safetensors")
+    loaded = btfkit.load(tmp_path / "m.safetensors")
+    assert loaded.spec == fitted(model).spec
+    assert loaded.header == fitted(model).header
+    for ours, theirs in zip(
+        loaded.evaluate(*queries), fitted(model).evaluate(*queries), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@every_model
+def test_equal_seeds_give_equal_bytes_and_other_seeds_others(model: str, tmp_path: Path) -> None:
+    steps, settings = TINY[model]
+    steps = min(steps, 12)
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        out = tmp_path / f"{name}.safetensors"
+        fit(tiny(), model=model, steps=steps, settings=settings, device="cpu", seed=seed, out=out)
+    a, b, c = ((tmp_path / f"{name}.safetensors").read_bytes() for name in "abc")
+    assert a == b
+    assert a != c
+
+
+@every_model
+def test_hostile_queries_are_finite_and_masked_ones_answer_nothing(model: str) -> None:
+    bad = [np.nan, np.inf, -np.inf]
+    uv = [[v, 0.5] for v in bad] + [[0.5, 0.5]] * 5 + [[1e6, -1e6], [1e15, 0], [-0.0, 1.0]]
+    light = np.tile([0.0, 0.6, 0.8], (11, 1))
+    view = np.tile([0.6, 0.0, 0.8], (11, 1))
+    view[3] = np.nan
+    view[4] = 0
+    view[5] = [0.6, 0, -0.8]
+    light[6] = [np.inf, 0, 1]
+    light[7] = 0
+    with pytest.warns(UserWarning, match="8 of 11 queries are not finite or seen from below"):
+        rgb, opacity = fitted(model).evaluate(uv, light, view)
+    assert np.isfinite(rgb).all()
+    assert np.isfinite(opacity).all()
+    assert not rgb[:8].any()
+    assert not opacity[:8].any()
+    assert (rgb[8:] > 0).any()
+
+
+@every_model
+def test_grazing_directions_are_finite(model: str) -> None:
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    horizon = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
+    almost = horizon + [0, 0, 1e-7]
+    with warnings.catch_warnings():
+        # Rounding may put a view below the horizon: it then counts as masked.
+        warnings.simplefilter("ignore", UserWarning)
+        for light in (horizon, almost):
+            rgb, _ = fitted(model).evaluate([0.3, 0.7], light, almost[:, None])
+            assert np.isfinite(rgb).all()
+            assert np.abs(rgb).max() < 100
+
+
+@every_model
+def test_light_from_below_answers_black_and_opaque_on_flat_models(model: str) -> None:
+    if model in FULL_SPHERE:
+        pytest.skip("answers for the whole sphere of lights")
+    rgb, opacity = fitted(model).evaluate([0.2, 0.2], [0.1, 0.2, -0.9], [0, 0.1, 0.9])
+    assert not rgb.any()
+    assert opacity == 1
+
+
+@every_model
+def test_a_tile_repeats_exactly(model: str) -> None:
+    rng = np.random.default_rng(5)
+    # eighths: whole tiles away they are the same numbers
+    uv = rng.integers(0, 8, (40, 2)) / 8
+    light, view = upper(rng, 40), upper(rng, 40)
+    here = fitted(model).evaluate(uv, light, view).reflectance
+    for shift in ([3, -2], [-1000, 7], [1e9, -1e9]):
+        there = fitted(model).evaluate(uv + shift, light, view).reflectance
+        np.testing.assert_array_equal(there, here)
+
+
+@every_model
+def test_a_sample_that_does_not_tile_goes_on_as_its_border(model: str) -> None:
+    material = fitted_to(replace(tiny(), wrap="clamp"), model)
+    assert material.header.wrap == "clamp"
+    rng = np.random.default_rng(6)
+    light, view = upper(rng, 20), upper(rng, 20)
+    inside = rng.random(20)
+    for beyond, border in ((-7.5, 0.0), (1.5, 1.0)):
+        for axis in (0, 1):
+            far, near = np.stack([inside, inside], -1), np.stack([inside, inside], -1)
+            far[:, axis], near[:, axis] = beyond, border
+            np.testing.assert_array_equal(
+                material.evaluate(far, light, view).reflectance,
+                material.evaluate(near, light, view).reflectance,
+            )
+
+
+@every_model
+def test_a_model_beats_the_mean_of_each_channel(model: str) -> None:
+    btf, material = tiny(), fitted(model)
+    truth = np.stack([btf.texture(i) for i in range(len(btf))])
+    answer = np.stack([answer_pair(material, btf, i) for i in range(len(btf))])
+    assert np.square(answer - truth).mean() < truth.var(axis=(0, 1, 2)).mean()
+
+
+@pytest.mark.parametrize("model", sorted(CLOSED_FORM))
+def test_a_white_diffuser_is_exact(model: str) -> None:
+    btf = tiny()
+    white = np.broadcast_to(btf.light[:, None, None, 2:], btf.shape)
+    material = fitted_to(replace(btf, textures=white), model)
+    rng = np.random.default_rng(7)
+    light, view = upper(rng, 50), upper(rng, 50)
+    rgb = material.evaluate(rng.random((50, 2)), light, view).reflectance
+    # float16 textures; the factorisation multiplies two of them, under a logarithm: its
+    # blending of directions is exact where values are small against the floor of that
+    tolerance = 0.02 if model == "pca" else 1e-3
+    np.testing.assert_allclose(rgb, np.broadcast_to(light[:, 2:], rgb.shape), atol=tolerance)
+
+
+@every_model
+@pytest.mark.parametrize("channels", [("Y",), ("450", "550", "600", "650", "700")])
+def test_any_number_of_channels(model: str, channels: tuple[str, ...]) -> None:
+    btf = tiny()
+    textures = np.stack([btf.texture(i)[..., 0] for i in range(len(btf))])[..., None]
+    textures = textures * np.linspace(0.5, 1, len(channels), dtype=np.float32)
+    steps, settings = TINY[model]
+    changed = replace(btf, textures=textures, channels=channels)
+    material = fit(changed, model=model, steps=min(steps, 3), settings=settings).material
+    rgb, _ = material.evaluate([0.1, 0.2], [0, 0, 1], [0, 0, 1])
+    assert rgb.shape == (len(channels),)
+    assert material.header.channels == channels
+
+
+@every_model
+def test_missing_values_do_not_reach_answers(model: str) -> None:
+    btf = tiny()
+    textures = np.stack([btf.texture(i) for i in range(len(btf))])
+    rng = np.random.default_rng(8)
+    textures[rng.random(textures.shape[:3]) < 0.1] = np.nan
+    textures[:, 3, 5] = np.nan
+    textures[11] = np.inf
+    steps, settings = TINY[model]
+    broken = replace(btf, textures=textures)
+    material = fit(broken, model=model, steps=min(steps, 20), settings=settings).material
+    answers = np.stack([answer_pair(material, btf, i) for i in range(0, len(btf), 7)])
+    assert np.isfinite(answers).all()
+    assert answers.max() < 20 * btf.texture(0).max()
+
+
+@every_model
+def test_an_unknown_setting_is_named_with_those_there_are(model: str) -> None:
+    with pytest.raises(ValueError, match=f"{model} has no setting sparkle; it has"):
+        fit(tiny(), model=model, steps=1, settings={"sparkle": "1"})
+
+
+def test_no_model_needs_torch_to_answer(tmp_path: Path) -> None:
+    for model in MODELS:
+        btfkit.materials.file.save(fitted(model), tmp_path / f"{model}.safetensors")
+    code = (
+        "import sys, pathlib; sys.modules['torch'] = None; import btfkit\n"
+        "for path in sorted(pathlib.Path(sys.argv[1]).glob('*.safetensors')):\n"
+        "    print(btfkit.load(path).evaluate([0.5, 0.5], [0, 0, 1], [0, 0, 1]).reflectance.shape)"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=False
+    )
+    assert run.stdout.splitlines() == ["(3,)"] * len(MODELS), run.stderr
