@@ -90,11 +90,24 @@ def test_an_image_that_tiles_is_returned_unchanged(shape: tuple[int, int], seed:
     np.testing.assert_array_equal(make_tileable(image), image)
 
 
-def test_a_lattice_that_closes_is_returned_unchanged() -> None:
-    image = lattice(96, 120, (24, 30), noise=0.3)
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("periods", [(24, 32), (48, 64), (12, 16)])
+def test_a_lattice_closes_after_whole_periods_only(periods: tuple[int, int], seed: int) -> None:
+    # Half the side is a whole number of periods: no line may be taken for a stranger by distance.
+    image = np.roll(lattice(96, 128, periods, noise=0.2, seed=seed), (3 * seed, 5 * seed), (0, 1))
     tile, tiling = tile_image(image)
     np.testing.assert_array_equal(tile, image)
-    assert tiling.period == (96, 120)
+    assert tiling.period == (96, 128)
+    cut = image[: 96 - periods[0] * 2 // 5, : 128 - periods[1] * 2 // 5]
+    assert min(side.overlap for side in tile_image(cut)[1].sides) > 0
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("size", [2.0, 4.0, 8.0])
+def test_a_window_of_a_stochastic_texture_does_not_close(size: float, seed: int) -> None:
+    image = grains(96, 128, size=size, seed=seed)
+    assert tile_image(image)[1].index.is_identity
+    assert min(side.overlap for side in tile_image(image[:80, :109])[1].sides) > 0
 
 
 @pytest.mark.parametrize("periods", [(24, 31), (40, 17), (23, 23), (9, 60)])

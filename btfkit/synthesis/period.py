@@ -161,10 +161,12 @@ def _closes(raw: Floats, period: int) -> bool:
         at = np.rint(np.arange(1, repeats) * size / repeats).astype(int) - 1
         expected = apart[at]
     across = float(_mean_step(raw[:, -1], raw[:, 0]))
-    stranger = float(_steps(raw, size // 2).mean())
+    far = np.unique(np.linspace(size / 4, 3 * size / 4, 8).astype(int))
+    stranger = float(np.mean([_steps(raw, int(apart)).mean() for apart in far]))
     neighbour = float(expected.mean())
     spread = float(apart.std()) if repeats == 1 else float(expected.std())
-    return across <= neighbour + 0.25 * max(stranger - neighbour, 0.0) + 0.5 * spread + 1e-12
+    allowed = max(0.2 * (stranger - neighbour), 0.1 * neighbour, 0.5 * spread)
+    return across <= neighbour + allowed + 1e-12
 
 
 def _steps(raw: Floats, apart: int) -> Floats:
