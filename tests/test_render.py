@@ -816,6 +816,6 @@ def test_wrong_options_are_refused_before_a_file_appears(
 def test_progress_reaches_the_whole_picture() -> None:
     told: list[tuple[int, int]] = []
     note: Callable[[int, int], None] = lambda done, total: told.append((done, total))  # noqa: E731
-    pictured(Painted(white()), "plane", size=(200, 300), progress=note)
-    assert told[-1] == (60000, 60000)
+    pictured(Painted(white()), "plane", size=(64, 128), samples=64, progress=note)
+    assert told[-1] == (8192, 8192)
     assert len(told) > 1

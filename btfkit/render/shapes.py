@@ -56,7 +56,8 @@ class Shape(ABC):
     """A surface with tiles on it.
 
     Attributes:
-        half_height: of a square picture that shows it whole from the front.
+        half_height: of a square picture that shows it whole from everywhere; of a plane, that it
+            fills from the front.
         tile: width of a tile where it is not distorted; curvature counts in it.
         convex: whether no point of its outside shadows another.
     """
@@ -160,7 +161,7 @@ class Cylinder(Shape):
         self.tile = np.pi / repeat
         self._tile_height = self.tile / aspect
         self._half = np.pi / aspect / 2
-        self.half_height = 1.04 * max(1.0, self._half)
+        self.half_height = 1.04 * float(np.hypot(1.0, self._half))
 
     def meet(self, origin: Floats, direction: Floats, beyond: Floats) -> Meeting:
         flat, way = origin[:, ::2], direction[:, ::2]
