@@ -61,10 +61,7 @@ class Summary:
         apart = np.minimum(np.abs(a - b), _MOST)
         good = np.isfinite(apart)
         mean: Floats = np.where(good, apart, 0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)
-        missing: list[Floats] = [
-            (~np.isfinite(side).any(axis=0)).astype(np.float64) for side in (a, b)
-        ]
-        return mean, missing[0], missing[1]
+        return mean, _missing(a), _missing(b)
 
 
 def spread_out(light: Floats, view: Floats, count: int) -> Sequence[int]:

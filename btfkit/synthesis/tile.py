@@ -15,15 +15,12 @@ from btfkit.materials.evaluation import texel_centres
 from btfkit.materials.neubtf import NeuBTF
 from btfkit.synthesis.drift import Drift
 from btfkit.synthesis.indexmap import IndexMap
+from btfkit.synthesis.join import joined
 from btfkit.synthesis.period import Side, side_of
-from btfkit.synthesis.seam import closed_cut, open_cut
 from btfkit.synthesis.summary import Summary, spread_out
 from btfkit.synthesis.textures import Strengths, TiledTextures, bent
 
 Array = NDArray[np.float32]
-Grid = tuple[NDArray[np.intp], NDArray[np.intp]]
-# A sample may lie askew by this slope, if its ends agree so much better then.
-_LEAN, _GAIN = 1 / 16, 0.1
 # Slices that are looked at for the one map of all.
 _SLICES = 8
 
@@ -167,60 +164,7 @@ def _tiling(summary: Summary) -> Tiling:
     if not rows.overlap and not cols.overlap:
         return Tiling(IndexMap.identity(rows.size, cols.size), (rows, cols), None, 1.0)
     drift = Drift.of((rows.start, cols.start), (rows.tile, cols.tile), (rows.overlap, cols.overlap))
-    return Tiling(_joined(summary, rows, cols), (rows, cols), drift, 1.0)
-
-
-def _joined(summary: Summary, rows: Side, cols: Side) -> IndexMap:
-    """The tile whose ends are joined by cuts of least error.
-
-    First the columns are joined over all rows of the window. What that gives has no side any
-    more, so the cut that joins its rows runs around it and closes, whatever it crosses.
-    """
-    height = rows.tile + rows.overlap
-    row = np.arange(rows.start, rows.start + height)[:, None]
-    col = cols.start + np.broadcast_to(np.arange(cols.tile), (height, cols.tile))
-    if cols.overlap:
-        near = np.broadcast_to(row, (height, cols.overlap)), col[:, : cols.overlap]
-        parts = summary.mismatch(near, (near[0], near[1] + cols.tile))
-        # Without an overlap of the rows their ends meet already: the cut must meet itself too.
-        cut = (open_cut if rows.overlap else closed_cut)(*(part.T for part in parts))
-        far = np.arange(cols.tile) < cut[:, None]
-        col = col + cols.tile * far
-    whole = np.broadcast_to(row, col.shape)
-    if not rows.overlap:
-        return IndexMap(whole, col, (rows.size, cols.size))
-    near, far = ((whole[part], col[part]) for part in _bands(rows))
-    lean = _lean(summary, near, far, rows.tile)
-    far = far[0], np.roll(far[1], -lean, axis=1)
-    cut = closed_cut(*summary.mismatch(near, far))
-    x, y = np.indices((rows.tile, cols.tile))
-    beyond = x < cut
-    # Straightened row by row: going down one tile leads back to the same column.
-    back = np.rint(lean * x / rows.tile).astype(np.intp)
-    x, y = x + rows.tile * beyond, (y + lean * beyond) % cols.tile
-    turned = (np.arange(cols.tile) + back) % cols.tile
-    x, y = (np.take_along_axis(part, turned, axis=1) for part in (x, y))
-    return IndexMap(rows.start + x, col[x, y], (rows.size, cols.size))
-
-
-def _bands(side: Side) -> tuple[slice, slice]:
-    """The overlap at the near end of a window, and at its far end."""
-    return slice(0, side.overlap), slice(side.tile, side.tile + side.overlap)
-
-
-def _lean(summary: Summary, near: Grid, far: Grid, tile: int) -> int:
-    """Columns by which the far end continues the near one better than straight; 0 for none.
-
-    A sample that lies a little askew agrees with itself a tile down and a few columns aside.
-    """
-    a, b = (np.nan_to_num(summary.flat[:, at[0], at[1]]) for at in (near, far))
-    spectra = np.fft.rfft(a, axis=2).conj() * np.fft.rfft(b, axis=2)
-    scale = np.sqrt(np.square(a, dtype=float).sum() * np.square(b, dtype=float).sum())
-    agreement = np.fft.irfft(spectra.sum(axis=(0, 1)), a.shape[2]) / max(scale, 1e-30)
-    most = round(min(a.shape[2], tile) * _LEAN)
-    leans = np.arange(-most, most + 1)
-    best = int(leans[np.argmax(agreement[leans])])
-    return best if agreement[best] > agreement[0] + _GAIN else 0
+    return Tiling(joined(summary, rows, cols), (rows, cols), drift, 1.0)
 
 
 def _far(btf: BTF, index: IndexMap) -> dict[str, Any]:
