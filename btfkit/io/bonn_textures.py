@@ -238,9 +238,10 @@ class ViewTextures(BonnTextures):
 
 @final
 class ValueTextures(BonnTextures):
-    """BDI: the values themselves, texel by texel; an image has one value of each.
+    """BDI: the values themselves, texel by texel.
 
-    Texels outside the mask are NaN where the file does not store them.
+    An image has one value of each texel, and so touches all of the file: ask for windows, for
+    texels, or for many images at once. Texels that a sparse file does not store are NaN.
     """
 
     def __init__(self, path: Path, layout: Layout, grid: Grid, chunks: Chunks) -> None:
@@ -248,22 +249,24 @@ class ValueTextures(BonnTextures):
         self._path, self._chunks = path, chunks
         self._unpacked: OrderedDict[int, NDArray[np.uint8]] = OrderedDict()
         self._lock = threading.Lock()
-        stored = chunks.mask if chunks.compression == 2 else np.ones_like(chunks.mask)
-        # Place of each texel among those that its chunk stores.
-        self._place = np.empty(stored.shape, np.int64)
-        for start in range(0, len(stored), chunks.rows):
-            part = stored[start : start + chunks.rows]
-            self._place[start : start + chunks.rows] = (np.cumsum(part) - 1).reshape(part.shape)
-        self._stored = stored
+        self._sparse = chunks.compression == 2
+        if self._sparse:
+            # Place of each texel among those that its chunk stores.
+            self._places = np.empty(chunks.mask.shape, np.int64)
+            for start in range(0, len(chunks.mask), chunks.rows):
+                part = chunks.mask[start : start + chunks.rows]
+                placed = np.maximum(np.cumsum(part) - 1, 0)
+                self._places[start : start + chunks.rows] = placed.reshape(part.shape)
 
     def _fill(self, pairs: Index, scale: Array, out: Array) -> None:
         rows, cols = self._grid.rows, self._grid.cols
         for number in np.unique(rows // self._chunks.rows):
             inside = np.flatnonzero(rows // self._chunks.rows == number)
             r, c = rows[inside, None], cols[None, :]
-            found = self._chunk(int(number))[self._place[r, c]][:, :, pairs].astype(np.float32)
+            places = self._place(r, c)[..., None]
+            found = self._chunk(int(number))[places, pairs].astype(np.float32)
             found[~np.isfinite(found)] = np.nan
-            found[~self._stored[r, c]] = np.nan
+            found[self._missing(r, c)] = np.nan
             out[:, inside] = np.moveaxis(found, 2, 0) * scale[:, None, None, None]
 
     def _pick(self, pairs: Index, scale: Array, rows: Index, cols: Index) -> Array:
@@ -271,11 +274,22 @@ class ValueTextures(BonnTextures):
         numbers = rows // self._chunks.rows
         for number in np.unique(numbers):
             inside = np.flatnonzero(numbers == number)
-            place = self._place[rows[inside], cols[inside]]
+            place = self._place(rows[inside], cols[inside])
             out[inside] = self._chunk(int(number))[place, pairs[inside]]
         out[~np.isfinite(out)] = np.nan
-        out[~self._stored[rows, cols]] = np.nan
+        out[self._missing(rows, cols)] = np.nan
         return out * scale[:, None]
+
+    def _place(self, rows: Index, cols: Index) -> Index:
+        """Place of texels within their chunk; rows and columns broadcast."""
+        if self._sparse:
+            return self._places[rows, cols]
+        return rows % self._chunks.rows * self._layout.width + cols
+
+    def _missing(self, rows: Index, cols: Index) -> NDArray[np.bool_]:
+        """Whether texels are not in the file."""
+        missing = ~self._chunks.mask[rows, cols]
+        return missing if self._sparse else np.zeros_like(missing)
 
     def _chunk(self, number: int) -> NDArray[np.float16]:
         """(texels, pairs, c) values of a chunk."""
@@ -292,7 +306,7 @@ class ValueTextures(BonnTextures):
             if number in self._unpacked:
                 self._unpacked.move_to_end(number)
                 return self._unpacked[number]
-        inside = self._stored[number * self._chunks.rows :][: self._chunks.rows]
+        inside = self._chunks.mask[number * self._chunks.rows :][: self._chunks.rows]
         expected = 2 * inside.size * self._layout.pairs * self.shape[3]
         try:
             unpacker = bz2.BZ2Decompressor()
