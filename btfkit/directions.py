@@ -56,7 +56,9 @@ def to_angles(direction: ArrayLike) -> tuple[Floats, Floats]:
     """
     x, y, z = np.moveaxis(np.asarray(direction, float), -1, 0)
     tangential = np.hypot(x, y)
-    phi = np.where(tangential > 0, np.arctan2(y, x) % (2 * np.pi), 0.0)
+    phi = np.arctan2(y, x) % (2 * np.pi)
+    # The remainder of -1e-16 rounds to a whole turn.
+    phi = np.where((tangential > 0) & (phi < 2 * np.pi), phi, 0.0)
     return np.arctan2(tangential, z), phi
 
 
