@@ -19,6 +19,7 @@ from btfkit import colour, metrics
 from btfkit.btf import BTF
 from btfkit.cli import btfkit as group
 from btfkit.cli.outcome import run
+from btfkit.cli.tiling import tile_file
 from btfkit.io import images, store, store_write
 from btfkit.materials import file
 from btfkit.materials.base import Header
@@ -565,6 +566,27 @@ def test_a_model_that_wraps_is_left_as_it_is() -> None:
     assert tile_neubtf(wraps)[0] is wraps
 
 
+def test_propagation_onto_a_tileable_guidance_is_propagation_onto_its_tile(
+    photo: np.ndarray, tmp_path: Path
+) -> None:
+    import torch
+
+    from btfkit.fitting.unet import Encoder
+    from btfkit.propagation import propagate
+
+    model = neubtf()
+    encoder = Encoder(model.spec.latents, torch.Generator().manual_seed(0)).state_dict()
+    training = {f"encoder.{name}": value.numpy() for name, value in encoder.items()}
+    training |= {"mean": np.zeros(4, np.float32), "deviation": np.ones(4, np.float32)}
+    file.save(model, tmp_path / "a.safetensors", training=training)
+    tile = make_tileable(photo)
+    found = propagate(photo, tmp_path / "a.safetensors", tileable=True)
+    assert found.header.wrap == "wrap"
+    assert found.header.grid == tile.shape[:2]
+    expected = propagate(tile, tmp_path / "a.safetensors", wrap="wrap")
+    np.testing.assert_array_equal(found.weights["texture"], expected.weights["texture"])
+
+
 # --- files -----------------------------------------------------------------------------------
 
 
@@ -695,6 +717,9 @@ def test_a_store_becomes_a_store_of_the_same_depth(
     assert back.textures.dtype == np.dtype(dtype)
     assert (back.wrap, back.texel_mm, back.licence) == ("wrap", 0.2, "CC0")
     assert back.history[-1].startswith("tiled: 61 x 73")
+    calls: list[tuple[float, float]] = []
+    tile_file("wool.btf.zarr", "b.btf.zarr", progress=lambda *at: calls.append(at))
+    assert calls[-1] == (6, 6)
     expected = tile_btf(btfkit.open("wool.btf.zarr"))[0]
     np.testing.assert_allclose(back.texture(3), expected.texture(3), rtol=1e-3)  # float16
     assert call("tile", "wool.btf.zarr") == 1

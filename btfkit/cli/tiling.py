@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
-from btfkit.cli.bar import Bar
 from btfkit.errors import BtfkitError
 from btfkit.files import refuse_existing, whole
 from btfkit.io import images, store
 from btfkit.synthesis import Tiling
 
+Progress = Callable[[int, int], None]
 _KINDS = "an image, a BTF store (*.btf.zarr) or a NeuBTF model (*.safetensors)"
 
 
@@ -19,7 +20,7 @@ def tile_file(
     out: str | os.PathLike[str] | None = None,
     *,
     force: bool = False,
-    progress: Bar | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Tiling, Path]:
     """Write the tileable version of a file in its own kind.
 
@@ -75,7 +76,9 @@ def _declined(path: Path) -> BtfkitError:
     return BtfkitError(f"{found} cannot be tiled; expected {_KINDS}", remedy=remedy)
 
 
-def _tile_store(path: Path, final: Path, force: bool, progress: Bar | None) -> Tiling:
+def _tile_store(
+    path: Path, final: Path, force: bool, progress: Callable[[int, int], None] | None
+) -> Tiling:
     from btfkit.io import store_write
     from btfkit.synthesis import tile_btf
 
