@@ -66,7 +66,7 @@ def _read_codes(name: str, data: bytes, transfer: str) -> Array:
     if codes.ndim == 2:
         codes = codes[..., None]
     if codes.shape[2] == 3:
-        codes = codes[..., ::-1]
+        codes = cv2.cvtColor(codes, cv2.COLOR_BGR2RGB)
     if codes.dtype == np.uint8:
         linear = cv2.LUT(np.ascontiguousarray(codes), colour.table(transfer, 8))
         return np.asarray(linear, np.float32).reshape(codes.shape)
