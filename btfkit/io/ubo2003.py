@@ -82,7 +82,7 @@ def write(
         progress: called with (images written, n).
 
     Raises:
-        ValueError: channels that a JPEG does not have, or two pairs with the same name.
+        ValueError: channels that a JPEG does not have, or directions between whole degrees.
     """
     if btf.shape[3] not in (1, 3):
         raise ValueError(f"UBO2003 files hold 1 or 3 channels; the BTF has {btf.shape[3]}")
@@ -103,6 +103,8 @@ def _names(btf: BTF) -> list[str]:
     """Relative names: running number (81 * light + view where they are Bonn's), four angles."""
     lights, light_index = directions.unique(btf.light)
     views, view_index = directions.unique(btf.view)
+    for name, table in (("light", lights), ("view", views)):
+        _refuse_fractions(name, table)
     light_degrees, view_degrees = (_whole_degrees(table) for table in (lights, views))
     names = []
     for i, j in zip(light_index, view_index, strict=True):
@@ -117,6 +119,20 @@ def _names(btf: BTF) -> list[str]:
             "write utia or manifest instead"
         )
     return names
+
+
+def _refuse_fractions(name: str, table: np.ndarray) -> None:
+    """Refuse directions that whole degrees would move."""
+    rounded = directions.from_angles(*np.radians(np.array(_whole_degrees(table), float)).T)
+    moved = np.linalg.norm(rounded - table, axis=1)
+    worst = int(np.argmax(moved))
+    # float32 directions are 1e-5 degrees off; 0.05 would be told from a whole degree in any name.
+    if moved[worst] > np.radians(0.05):
+        theta, phi = np.degrees(directions.to_angles(table[worst]))
+        raise ValueError(
+            f"a {name} has angles {theta:.2f}, {phi:.2f}: UBO2003 names hold whole degrees; "
+            "write utia or manifest instead"
+        )
 
 
 @functools.cache
