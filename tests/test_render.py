@@ -528,7 +528,46 @@ def test_only_what_is_seen_and_lit_is_asked() -> None:
     assert seen.asked < np.count_nonzero(seen.cover) < 32 * 32
 
 
+def test_holes_are_holes_on_the_dark_side_too() -> None:
+    holes = np.ones((8, 8))
+    holes[:, 2:4] = 0
+    covers = [
+        pictured(Painted(white(8), holes), "plane", light, size=(8, 8)).cover
+        for light in (ABOVE, -ABOVE)
+    ]
+    np.testing.assert_array_equal(covers, [holes, holes])
+
+
+def test_answers_that_are_not_finite_are_black_and_counted() -> None:
+    image, opacity = white(4), np.full((4, 4), 0.5)
+    image[0, 0], opacity[3, 3] = np.nan, np.nan
+    for shape in ("plane", "sphere"):
+        with pytest.warns(UserWarning, match=r"\d+ of \d+ answers .* are not finite"):
+            seen = pictured(Painted(image, opacity), shape, size=(16, 16))
+        assert np.isfinite(seen.radiance).all()
+        assert np.isfinite(seen.cover).all()
+        assert seen.cover.max() <= 1
+
+
 # --- environments and samples
+
+
+@pytest.mark.parametrize("values", [
+    np.ones((1, 1, 3)), np.pad(np.ones((1, 1, 3)) * 1e8, ((0, 6), (3, 9), (0, 0))),
+    np.pad(np.ones((1, 1, 3)) * 1e-30, ((5, 0), (0, 7), (0, 0))),
+])  # fmt: skip
+def test_group_26_extreme_numbers_and_skies_give_finite_light(values: np.ndarray) -> None:
+    environment = Environment(values)
+    edge = np.array([0, 1e-300, 0.25, 0.5 - 1e-16, 0.5, 0.5 + 1e-16, 1 - 2.0**-53])
+    square = np.stack(np.meshgrid(edge, edge), axis=-1).reshape(-1, 2)
+    for normal in (*np.eye(3), *-np.eye(3)):
+        light, weight = environment.sample(square, np.broadcast_to(normal, (len(square), 3)))
+        assert np.isfinite(weight).all()
+        assert (weight >= 0).all()
+        np.testing.assert_allclose(np.linalg.norm(light, axis=1), 1, atol=1e-12)
+        # Neither strategy can make more of the brightest light than the other allows.
+        sun = values.max() * 4 * np.pi
+        assert weight.max() <= sun / np.pi * 2 * (1 + 1e-9)
 
 
 def test_the_mean_over_an_environment_is_its_integral() -> None:

@@ -78,6 +78,8 @@ def render_verb(
 
     start = time.perf_counter()
     w, h = _checked_size(size)
+    if not all(math.isfinite(number) for number in (env_turn, exposure, *background)):
+        raise click.UsageError("--env-turn, --exposure and --background take finite numbers")
     final = out or Path(stem(source) + ".png")
     picture.check_name(final)
     refuse_existing(final, force=force)

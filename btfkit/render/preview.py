@@ -5,6 +5,7 @@ Only what is seen is ever asked, and only for lights that reach it.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, final
@@ -24,6 +25,7 @@ Ints = NDArray[np.intp]
 # Rays traced at once: many, since a lazy BTF decodes its textures anew for each block. Sheets that
 # a ray may pass. The share of light not worth following.
 _BLOCK, _MOST_SHEETS, _NOTHING = 1 << 18, 64, 1e-3
+_ABOVE = np.array([0.0, 0.0, 1.0])
 
 
 @final
@@ -117,6 +119,12 @@ def render(
         cover[block] = share.reshape(len(pixels), samples).mean(axis=1)
         if progress:
             progress(start + len(pixels), h * w)
+    if painter.not_finite:
+        warnings.warn(
+            f"{painter.not_finite} of {painter.asked} answers of the material are not finite; "
+            "they count as black",
+            stacklevel=2,
+        )
     return Picture(radiance.reshape(h, w, c), cover.reshape(h, w), painter.asked)
 
 
@@ -129,7 +137,7 @@ class _Painter:
         # Samples share the pixel: each answers for its part.
         self._pixel = np.stack([camera.right, camera.down]) / np.sqrt(drawn.samples)
         self._shadows = Shadows(scene.material, scene.shape, self._pixel)
-        self._own = 0
+        self._own = self.not_finite = 0
 
     @property
     def asked(self) -> int:
@@ -167,7 +175,7 @@ class _Painter:
         """Radiance (m, c) towards the eye and opacity (m,); numbers (m, 2) choose from the sky."""
         scene, count = self._scene, len(seen.uv)
         total = np.zeros((count, len(scene.material.header.channels)))
-        opacity = np.ones(count)
+        opacity: Floats = np.ones(count)
         one = np.ones((1, 1))
         sources: list[tuple[Floats, Floats]] = [
             (np.broadcast_to(light, (count, 3)), one) for light in scene.lights
@@ -177,20 +185,28 @@ class _Painter:
         for index, (light, weight) in enumerate(sources):
             local = np.einsum("ijk,ik->ij", seen.frame, light)
             lit = scene.material.full_sphere | (local[:, 2] > 0)
-            # Whoever knows the holes is asked once, lit or not.
-            rows = (
-                np.flatnonzero(lit | (index == 0)) if self._shadows.holes else np.flatnonzero(lit)
-            )
+            # Holes are asked for once, lit or not, by a light that every material answers.
+            ask_holes = index == 0 and self._shadows.holes
+            rows = np.arange(count) if ask_holes else np.flatnonzero(lit)
             if not rows.size:
                 continue
-            rgb, cover = scene.material.evaluate(
-                seen.uv[rows], local[rows], seen.view[rows], seen.footprint[rows],
-                seen.curvature[rows],
+            rgb, cover = self._answer(
+                seen.uv[rows], np.where(lit[rows, None], local[rows], _ABOVE), seen.view[rows],
+                seen.footprint[rows], seen.curvature[rows],
             )  # fmt: skip
-            self._own += len(rows)
-            if index == 0 and self._shadows.holes:
-                opacity = cover.astype(float)
+            if ask_holes:
+                opacity = cover
+            reached = lit[rows] * self._shadows.reached(surface, seen, light, local, rows)
             share = np.broadcast_to(weight, (count, weight.shape[1]))[rows]
-            reached = self._shadows.reached(surface, seen, light, local, rows)
             total[rows] += rgb * share * reached[:, None]
         return total, opacity
+
+    def _answer(self, *query: Floats) -> tuple[Floats, Floats]:
+        """What the material answers; what is not finite counts as black and opaque."""
+        rgb, cover = self._scene.material.evaluate(*query)
+        self._own += len(rgb)
+        bad = ~np.isfinite(cover) | ~np.isfinite(rgb).all(axis=1)
+        if bad.any():
+            self.not_finite += int(bad.sum())
+            rgb, cover = np.where(bad[:, None], 0, rgb), np.where(bad, 1, cover)
+        return rgb, cover.astype(float)

@@ -11,6 +11,11 @@ Floats = NDArray[np.floating]
 # The root of g³ = g + 1: multiples of 1/g and 1/g² fill the square evenly.
 _PLASTIC = 1.3247179572447460
 _STEP = np.array([1 / _PLASTIC, 1 / _PLASTIC**2])
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_MIX = (
+    (np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)),
+    (np.uint64(27), np.uint64(0x94D049BB133111EB)),
+)
 
 
 @final
@@ -32,7 +37,7 @@ class Samples:
         self._within = _tent(sequence) if samples > 1 else np.zeros((1, 2))
         # Another order, so that a place in the pixel does not go with a direction of light.
         self._lights = sequence[rng.permutation(samples)]
-        self._shifts = rng.random((size[0] * size[1], 2)) if samples > 0 else np.zeros((0, 2))
+        self._key = rng.integers(1 << 63, size=2, dtype=np.uint64)
 
     def places(self, pixels: NDArray[np.intp]) -> Floats:
         """(pixels * samples, 2) columns and rows in the picture, mirrored at its borders."""
@@ -44,7 +49,18 @@ class Samples:
 
     def lights(self, pixels: NDArray[np.intp]) -> Floats:
         """(pixels * samples, 2) even numbers in 0..1."""
-        return ((self._lights + self._shifts[pixels, None]) % 1).reshape(-1, 2)
+        return ((self._lights + self._shifts(pixels)[:, None]) % 1).reshape(-1, 2)
+
+    def _shifts(self, pixels: NDArray[np.intp]) -> Floats:
+        """(pixels, 2) even numbers in 0..1.
+
+        Source: Steele et al., "Fast Splittable Pseudorandom Number Generators", 2014, the
+        finaliser in the constants of SplitMix64.
+        """
+        x = (pixels[:, None].astype(np.uint64) + np.uint64(1)) * _GOLDEN ^ self._key
+        for shift, factor in _MIX:
+            x = (x ^ (x >> shift)) * factor
+        return ((x ^ (x >> np.uint64(31))) >> np.uint64(11)) / 2.0**53
 
 
 def _tent(square: Floats) -> Floats:

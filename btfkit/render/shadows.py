@@ -12,8 +12,11 @@ from btfkit.render.gaze import Gaze, gaze
 from btfkit.render.shapes import NEAR, Floats, Meeting, Plane, Shape, Surface
 
 Ints = NDArray[np.intp]
-# Sheets that light may pass; the share of light not worth following; queries that look for holes.
-_MOST_SHEETS, _NOTHING, _PROBES = 16, 1e-3, 4096
+# Sheets that light may pass; the share of light not worth following.
+_MOST_SHEETS, _NOTHING = 16, 1e-3
+# Places and views that are looked at for holes: few views, since a lazy BTF decodes them.
+_PROBES = (256, 16)
+_ABOVE = np.array([0.0, 0.0, 1.0])
 
 
 @final
@@ -99,17 +102,17 @@ class Shadows:
         surface = self._shape.surface(origin, light, met)
         seen = gaze(self._material, self._shape, surface, -light, self._pixel)
         self.asked += len(light)
-        above = np.array([0.0, 0.0, 1.0])
-        return self._material.evaluate(
-            seen.uv, above, seen.view, seen.footprint, seen.curvature
+        opacity = self._material.evaluate(
+            seen.uv, _ABOVE, seen.view, seen.footprint, seen.curvature
         ).opacity
+        return np.where(np.isfinite(opacity), opacity, 1.0)
 
 
 def _has_holes(material: Material) -> bool:
     rng = np.random.default_rng(0)
-    z = rng.random(_PROBES)
-    angle = 2 * np.pi * rng.random(_PROBES)
+    places, views = _PROBES
+    z, angle = rng.random((views, 1)), 2 * np.pi * rng.random((views, 1))
     radius = np.sqrt(1 - z**2)
-    view = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
-    uv = rng.random((_PROBES, 2))
-    return bool((material.evaluate(uv, [0.0, 0.0, 1.0], view).opacity < 1).any())
+    view = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=2)
+    uv = rng.random((views, places, 2))
+    return bool((material.evaluate(uv, _ABOVE, view).opacity < 1).any())
