@@ -13,8 +13,8 @@ from torch import Tensor
 from btfkit.btf import BTF
 from btfkit.directions import normalize
 from btfkit.fitting.pool import Pool
-from btfkit.materials.blend import on_sample
 from btfkit.materials.evaluation import texel_centres
+from btfkit.materials.near import on_sample
 
 # The darkest noise of a dark-subtracted measurement, as the losses count it.
 _DARKEST = -0.1

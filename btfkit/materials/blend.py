@@ -1,122 +1,25 @@
-"""Which measured pairs answer for a light and a view, and with what weights.
-
-Directions are triangulated in parabolic coordinates (x, y) / (1 + z), where the hemisphere is the
-unit disc; a ring just outside it, each of whose points stands for the nearest measured direction,
-makes every query of the hemisphere fall into a triangle.
-"""
+"""Which measured pairs answer for a light and a view, and with what weights."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import Delaunay, cKDTree
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.directions import Floats
+from btfkit.materials.mesh import Mesh, parabolic
+from btfkit.materials.near import Near
 
 Array = NDArray[np.float32]
 Index = NDArray[np.intp]
 # With fewer partners than this on a side, a list of pairs is not a grid but scattered.
 _FEWEST_PARTNERS = 6
 _SCATTERED_NEIGHBOURS = 8
-# The ring touches the disc at 1: this much further out rounding cannot leave it.
-_RING_RADIUS = 1.02
-# Solving for the equivalent direction converges by texel size / distance to the lamp each time.
-_NEAR_STEPS = 6
-
-
-def parabolic(direction: ArrayLike) -> Floats:
-    """(..., 2) parabolic coordinates of (..., 3) unit vectors; the hemisphere is the unit disc."""
-    d = np.asarray(direction, float)
-    return d[..., :2] / (1 + d[..., 2:])
-
-
-@final
-class Mesh:
-    """A Delaunay triangulation of directions of the upper hemisphere.
-
-    Args:
-        table: (m, 3) distinct unit vectors, z at least 0.
-    """
-
-    def __init__(self, table: NDArray[np.floating]) -> None:
-        d = np.asarray(table, float)
-        lowest = int(np.sum(d[:, 2] <= d[:, 2].min() + 1e-3))
-        count = max(10, lowest)
-        azimuth = 2 * np.pi * np.arange(count) / count
-        horizon = directions.from_angles(np.full(count, np.pi / 2), azimuth)
-        radius = _RING_RADIUS / np.cos(np.pi / count)
-        self._stands_for = np.concatenate([np.arange(len(d)), np.argmax(horizon @ d.T, axis=1)])
-        self.points = np.concatenate([parabolic(d), radius * horizon[:, :2]])
-        self._half = float(np.abs(self.points).max()) * (1 + 1e-9)
-        self._triangulate()
-
-    def _triangulate(self) -> None:
-        triangles = Delaunay(self.points).simplices
-        a, b, c = (self.points[triangles[:, k]] for k in range(3))
-        edge, other = a - c, b - c
-        area = edge[:, 0] * other[:, 1] - edge[:, 1] * other[:, 0]
-        # Slivers between points on one line have no inverse, and no inside.
-        whole = np.abs(area) > 1e-14
-        edge, other, area = edge[whole], other[whole], area[whole]
-        self._triangles, self._origin = triangles[whole], c[whole]
-        rows = np.stack([other[:, 1], -other[:, 0], -edge[:, 1], edge[:, 0]], axis=1)
-        self._frame = (rows / area[:, None]).reshape(-1, 2, 2)
-        self._cells = int(np.clip(2 * np.sqrt(len(self._triangles)), 4, 64))
-        corners = self.points[self._triangles]
-        low, high = (self._cell(bound) for bound in (corners.min(axis=1), corners.max(axis=1)))
-        cell = np.arange(self._cells)
-        within = [
-            (low[:, k, None] <= cell) & (cell <= high[:, k, None]) for k in range(2)
-        ]  # each (triangles, cells)
-        reached = (within[0][:, :, None] & within[1][:, None]).reshape(len(corners), -1)
-        home, triangle = np.nonzero(reached.T)
-        count = reached.sum(axis=0)
-        slot = np.arange(len(home)) - np.repeat(np.cumsum(count) - count, count)
-        # The triangles that reach into each cell of a grid over the disc; the first one pads.
-        self._reaching = np.zeros((self._cells**2, count.max()), np.intp)
-        self._reaching[home, slot] = triangle
-
-    def _cell(self, point: Floats) -> Index:
-        cell = (point / self._half + 1) * (self._cells / 2)
-        return np.clip(cell.astype(np.intp), 0, self._cells - 1)
-
-    def weights(self, direction: NDArray[np.floating]) -> tuple[Index, Floats]:
-        """Three rows of the table and their weights, not negative and of sum 1.
-
-        Args:
-            direction: (b, 3) unit vectors, z at least 0.
-
-        Returns:
-            (b, 3) rows of the table, (b, 3) weights.
-        """
-        p = parabolic(direction)
-        cell = self._cell(p)
-        home = cell[:, 0] * self._cells + cell[:, 1]
-        best = np.full(len(p), -np.inf)
-        chosen = np.zeros(len(p), np.intp)
-        for candidates in self._reaching.T:
-            triangle = candidates[home]
-            inside = self._barycentric(triangle, p).min(axis=1)
-            better = inside > best
-            best[better], chosen[better] = inside[better], triangle[better]
-        weight = self._barycentric(chosen, p)
-        # A query on a measured direction is that direction, not its neighbours by rounding.
-        weight[weight < 1e-6] = 0
-        weight /= weight.sum(axis=1, keepdims=True)
-        return self._stands_for[self._triangles[chosen]], weight
-
-    def _barycentric(self, triangle: Index, p: Floats) -> Floats:
-        """(b, 3) weights of the corners of a triangle each, negative where p is outside."""
-        frame, step = self._frame[triangle], p - self._origin[triangle]
-        first = frame[:, 0, 0] * step[:, 0] + frame[:, 0, 1] * step[:, 1]
-        second = frame[:, 1, 0] * step[:, 0] + frame[:, 1, 1] * step[:, 1]
-        return np.stack([first, second, 1 - first - second], axis=1)
 
 
 @final
@@ -218,6 +121,14 @@ class Blend:
             return np.broadcast_to(pair, shape), np.broadcast_to(weight, shape)
         return self._weights(light, view)
 
+    def cosines(self, pair: Index, at: NDArray[np.floating] | None = None) -> Array:
+        """(b, k) cosines of the lights of pairs (b, k), as they fall on the places `at` (b, 2)."""
+        if self._lamps is None or at is None:
+            return self.light[pair, 2]
+        lamp = self._lamps.position[pair]
+        across = np.square(lamp[..., :2] - at[:, None]).sum(axis=-1)
+        return lamp[..., 2] / np.sqrt(across + np.square(lamp[..., 2]))
+
     def _weights(self, light: Floats | Array, view: Floats | Array) -> tuple[Index, Array]:
         if self._tree is not None:
             return self._scattered(light, view)
@@ -265,14 +176,6 @@ def pair_arrays(btf: BTF) -> dict[str, NDArray[np.float32]]:
     return {n: np.asarray(a, np.float32) for n, a in found.items() if a is not None}
 
 
-def on_sample(
-    uv: NDArray[np.floating], grid: tuple[int, int], texel_mm: float
-) -> NDArray[np.floating]:
-    """(b, 2) x and y in mm from the centre of the sample, of uv (b, 2)."""
-    h, w = grid
-    return (uv - 0.5) * np.array([w, -h]) * texel_mm
-
-
 def _joined(light: NDArray[np.floating], view: NDArray[np.floating]) -> Floats:
     return np.concatenate([parabolic(light), parabolic(view)], axis=1)
 
@@ -281,53 +184,3 @@ def _partners(outer: Index, inner: Index) -> float:
     """Median number of distinct inner directions for each outer one."""
     both = np.unique(np.stack([outer, inner], axis=1), axis=0)
     return float(np.median(np.bincount(both[:, 0])))
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Near:
-    """Lamps or cameras at finite distance: texels see them in directions of their own.
-
-    Attributes:
-        mesh: of their directions from the centre of the sample.
-        distance: (m,) mm from the centre.
-    """
-
-    mesh: Mesh
-    distance: Floats
-
-    @staticmethod
-    def of(position: NDArray[np.floating] | None) -> Near | None:
-        """From (n, 3) positions in mm from the centre; None stays None."""
-        if position is None:
-            return None
-        above = position[position[:, 2] >= 0]
-        unit = directions.normalize(above).astype(np.float32)
-        table, which = directions.unique(unit)
-        _, first = np.unique(which, return_index=True)
-        return Near(Mesh(table), np.linalg.norm(above[first].astype(float), axis=1))
-
-    def from_centre(self, direction: Array, at: NDArray[np.floating]) -> Array:
-        """The direction in which the centre sees what a texel sees along `direction`.
-
-        The lamps lie on a surface around the sample, between them at a distance blended from
-        theirs; where the texel's ray meets it, the centre looks. Exact at every lamp.
-
-        Args:
-            direction: (b, 3) unit vectors from the texels. at: (b, 2) texels, mm.
-
-        Returns:
-            (b, 3) unit vectors.
-        """
-        along = direction.astype(float)
-        foot = np.concatenate([at, np.zeros((len(at), 1))], axis=1)
-        across = np.sum(foot * along, axis=1)
-        seen = along
-        for _ in range(_NEAR_STEPS):
-            row, weight = self.mesh.weights(seen)
-            reach = np.sum(self.distance[row] * weight, axis=1)
-            inside = np.square(across) + np.square(reach) - np.sum(np.square(foot), axis=1)
-            way = np.sqrt(np.maximum(inside, 0)) - across
-            seen = directions.normalize(foot + np.maximum(way, 1e-9)[:, None] * along)
-            seen[:, 2] = np.maximum(seen[:, 2], 0)
-        return seen.astype(np.float32)

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from btfkit.btf import BTF
 from btfkit.materials.base import Array, Header, Material
 from btfkit.materials.bilinear import corners
-from btfkit.materials.blend import Blend, on_sample, pair_arrays
+from btfkit.materials.blend import Blend, pair_arrays
+from btfkit.materials.near import on_sample
 from btfkit.queries import Query
 
 # Below this cosine a light grazes, and a quotient by it is noise.
@@ -106,19 +107,22 @@ class Interpolation(Material):
             at = on_sample(query.uv, self.spec.size, self.header.texel_mm or 1.0)
         pair, weight = self._blend.weights(query.light, query.view, at)
         rows, cols, share = corners(query.uv, self.spec.size, self.header.wrap)
-        value, found = self._gathered(pair, weight, rows, cols, share, query.light[:, 2])
+        falloff = np.maximum(query.light[:, 2:], GRAZING) / np.maximum(
+            self._blend.cosines(pair, at), GRAZING
+        )
+        value, found = self._gathered(pair, weight, rows, cols, share, falloff)
         lost = np.flatnonzero((found <= 0).any(axis=1))
         if lost.size:
             again, found_again = self._gathered(
                 pair[lost], weight[lost] + _LAST_RESORT, rows[lost], cols[lost],
-                share[lost] + _LAST_RESORT, query.light[lost, 2],
+                share[lost] + _LAST_RESORT, falloff[lost],
             )  # fmt: skip
             value[lost] = np.where(found[lost] > 0, value[lost], again)
             found[lost] = np.where(found[lost] > 0, found[lost], found_again)
         return np.where(found > 0, value / np.where(found > 0, found, 1), 0).astype(np.float32)
 
     def _gathered(
-        self, pair: Any, weight: Any, rows: Any, cols: Any, share: Any, cosine: Array
+        self, pair: Any, weight: Any, rows: Any, cols: Any, share: Any, falloff: Any
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Weighted sums (b, c) of what is measured, and of the weights that it has."""
         b, c = len(pair), self.spec.channels
@@ -127,15 +131,13 @@ class Interpolation(Material):
         pairs = pair[query, which]
         values = self._btf.texels(pairs, rows[query, corner], cols[query, corner])
         total = total[query, which, corner].astype(np.float64)
-        falloff = np.maximum(cosine[query], GRAZING) / np.maximum(
-            self._btf.light[pairs, 2], GRAZING
-        )
+        scale = falloff[query, which]
         measured = np.isfinite(values)
         value, found = np.empty((b, c)), np.empty((b, c))
         for channel in range(c):
             good = measured[:, channel] * total
             found[:, channel] = np.bincount(query, good, b)
-            seen = np.where(measured[:, channel], values[:, channel], 0) * falloff
+            seen = np.where(measured[:, channel], values[:, channel], 0) * scale
             value[:, channel] = np.bincount(query, good * seen, b)
         return value, found
 

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from btfkit.materials.base import Array, Header, Material
 from btfkit.materials.bilinear import lookup
-from btfkit.materials.blend import Blend, on_sample
+from btfkit.materials.blend import Blend
 from btfkit.materials.interpolation import GRAZING
+from btfkit.materials.near import on_sample
 from btfkit.queries import Query
 
 Domain = Literal["log", "linear"]
@@ -66,7 +67,6 @@ class PCA(Material):
         self._blend = Blend.of(self.weights)
         if self._blend.near and header.texel_mm is None:
             raise ValueError("positions in mm need texel_mm, which the header does not know")
-        self._light_z = self._blend.light[:, 2]
         self._factors = [
             tuple(np.asarray(self.weights[f"{kind}.{k}"], np.float32) for kind in _KINDS)
             for k in range(len(spec.ranks))
@@ -107,7 +107,7 @@ class PCA(Material):
             texel = lookup(texture, query.uv, self.header.wrap)
             parts.append(texel @ row[0].T if len(row) == 1 else np.einsum("bck,bk->bc", row, texel))
         value = decoded(np.concatenate(parts, axis=1), self.spec.domain, self.spec.floor)
-        blended = np.sum(weight * np.maximum(self._light_z[pair], GRAZING), axis=1)
+        blended = np.sum(weight * np.maximum(self._blend.cosines(pair, at), GRAZING), axis=1)
         falloff = np.maximum(query.light[:, 2], GRAZING) / blended
         return np.maximum(value * falloff[:, None], 0).astype(np.float32)
 
