@@ -1,54 +1,49 @@
 """Face of the tracing kernel, and its plain numpy twin.
 
 Lengths are in texels: columns and rows count texel centres (row runs down, so it is -y), heights
-are in texel edges. Between four centres the height is bilinear, and along a ray through such a
-cell ray height minus relief is a quadratic: the first hit is exact, whatever its size.
+are in texel edges. Rays and cells: trace_march.py; here are light, reflectance and samples.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple, final
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from btfkit import native
+from btfkit.native.trace_march import (
+    Array,
+    Bools,
+    Floats,
+    Geometry,
+    Hit,
+    Line,
+    Patch,
+    Point,
+    bent,
+    corners,
+    geometry,
+    sent,
+)
 
-Array = NDArray[np.float32]
+__all__ = ["Geometry", "Traced", "geometry", "trace", "trace_plain"]
 
 # Start of secondary rays above the surface, texels.
-LIFT = np.float32(1e-3)
+LIFT = 1e-3
 # Lowest z of a traced direction, 89.4 degrees: closer to the horizon a ray crosses endless tiles.
-STEEPEST = np.float32(0.01)
-_ROWS_DOWN = np.array([1, -1, 1], np.float32)
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Geometry:
-    """A relief as the kernel wants it.
-
-    Attributes:
-        height: (h, w) texel edges.
-        maps: (h, w, 2 c + 4): albedo, specular, alpha along and across, tangent angle, opacity.
-        wrap: whether it repeats.
-        cellmax: (h, w) highest corner of the cell right of and below each centre.
-    """
-
-    height: Array
-    maps: Array
-    wrap: bool
-    cellmax: Array
-
-    @property
-    def channels(self) -> int:
-        """Of the reflectance."""
-        return (self.maps.shape[2] - 4) // 2
+STEEPEST = 0.01
+# Footprints beyond this are taken for this, texels.
+WIDEST = 1e6
 
 
 class Traced(NamedTuple):
-    """Per query: reflectance (b, c), opacity (b,); column, row, height, visibility seen (b,)."""
+    """Per query: reflectance (b, c), opacity (b,), and (b,) what its rays saw.
+
+    Means over the rays that met the relief: column, row and height of what was seen, texels, and
+    visibility of the light there; and the share of rays that met it at all (a hole is met, what
+    passes a silhouette is not). Where none did, the place that was asked for, and height 0.
+    """
 
     rgb: Array
     opacity: Array
@@ -56,16 +51,7 @@ class Traced(NamedTuple):
     row: Array
     height: Array
     visible: Array
-
-
-def geometry(height: Array, maps: Array, *, wrap: bool) -> Geometry:
-    """A `Geometry` with its table of cells."""
-    around = ((0, 1), (0, 1))
-    padded = np.pad(height, around, mode="wrap") if wrap else np.pad(height, around, mode="edge")
-    corners = [padded[:-1, :-1], padded[1:, :-1], padded[:-1, 1:], padded[1:, 1:]]
-    cellmax = np.maximum.reduce(corners)
-    contiguous = np.ascontiguousarray(height, np.float32)
-    return Geometry(contiguous, np.ascontiguousarray(maps, np.float32), wrap, cellmax)
+    met: Array
 
 
 def trace(
@@ -74,32 +60,39 @@ def trace(
     light: Array,
     view: Array,
     footprint: Array,
+    curvature: Array | None = None,
     *,
     samples: int = 1,
     bounces: int = 0,
     seed: int = 0,
 ) -> Traced:
-    """Answer flat queries on the plane; compiled where the kernel was built.
+    """Answer flat queries; compiled where the kernel was built.
 
     Args:
         relief: what is traced.
-        place: (b, 2) column and row on the plane z = 0, texels.
-        light, view: (b, 3) unit vectors, surface frame.
+        place: (b, 2) column and row on the surface z = 0, texels.
+        light, view: (b, 3) unit vectors, surface frame at the place.
         footprint: (b,) deviation of the Gaussian that samples are drawn from, texels; one sample
             is taken at its centre.
+        curvature: (b,) of the surface z = 0 along the projected view, 1/texel, positive convex,
+            1 + curvature * height positive throughout; None for the plane.
         samples: rays a query. bounces: further hits of light after the first. seed: of both.
     """
+    if curvature is None:
+        curvature = np.zeros(len(place), np.float32)
+    asked = tuple(
+        np.ascontiguousarray(part, np.float32)
+        for part in (place, light, view, footprint, curvature)
+    )
     kernel = native.load("trace")
     if kernel is None:
-        return trace_plain(
-            relief, place, light, view, footprint, samples=samples, bounces=bounces, seed=seed
-        )
+        return trace_plain(relief, *asked, samples=samples, bounces=bounces, seed=seed)
     count = len(place)
     rgb = np.empty((count, relief.channels), np.float32)
-    opacity, seen = np.empty(count, np.float32), np.empty((count, 4), np.float32)
-    parts = (np.ascontiguousarray(part, np.float32) for part in (place, light, view, footprint))
+    opacity, seen = np.empty(count, np.float32), np.empty((count, 5), np.float32)
     kernel.trace(
-        relief.height, relief.cellmax, relief.maps, relief.wrap, *parts,
+        relief.height, relief.level, relief.lowest, relief.highest,
+        relief.maps, relief.slot, relief.constant, relief.wrap, *asked,
         samples, bounces, seed & 0xFFFFFFFF, native.threads(), rgb, opacity, seen,
     )  # fmt: skip
     return Traced(rgb, opacity, *seen.T)
@@ -111,6 +104,7 @@ def trace_plain(
     light: Array,
     view: Array,
     footprint: Array,
+    curvature: Array | None = None,
     *,
     samples: int = 1,
     bounces: int = 0,
@@ -118,117 +112,185 @@ def trace_plain(
 ) -> Traced:
     """The same in numpy: one array operation for all rays, cell by cell."""
     count = len(place)
-    rgb = np.zeros((count, relief.channels), np.float32)
-    opacity, seen = np.zeros(count, np.float32), np.zeros((count, 4), np.float32)
+    if curvature is None:
+        curvature = np.zeros(count, np.float32)
+    rgb: Floats = np.zeros((count, relief.channels), np.float32)
+    cover, seen = np.zeros(count, np.float32), np.zeros((count, 5), np.float32)
+    patch = _patch(curvature, view)
     query = np.arange(count, dtype=np.uint32)
-    place, light, view = (np.asarray(part, np.float32) for part in (place, light, view))
     for index in range(samples):
-        offset = np.zeros_like(place)
+        shift: Floats = np.zeros_like(place)
         if samples > 1:
-            radius = footprint * np.sqrt(np.float32(-2) * np.log(_uniform(query, index, 0, seed)))
-            angle = np.float32(2 * np.pi) * _uniform(query, index, 1, seed)
-            offset = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        one, where = _sample(relief, place + offset, light, view, bounces, query, index, seed)
+            shift = _spread(query, index, samples, seed) * np.minimum(footprint, WIDEST)[:, None]
+        one, where = _sample(relief, patch, place + shift, light, view, bounces, query, index, seed)
+        met = where[:, 5]
         rgb += where[:, :1] * one
-        opacity += where[:, 0]
-        seen += where[:, 1:] - np.concatenate([offset, np.zeros_like(offset)], axis=1)
-    covered = opacity > 0
-    rgb[covered] /= opacity[covered, None]
-    return Traced(rgb, opacity / np.float32(samples), *(seen / np.float32(samples)).T)
+        cover += where[:, 0] * met
+        seen[:, :2] += (where[:, 1:3] - shift) * met[:, None]
+        seen[:, 2:4] += where[:, 3:5] * met[:, None]
+        seen[:, 4] += met
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rgb = np.where(cover[:, None] > 0, rgb / cover[:, None], 0)
+        mean = seen[:, :4] / seen[:, 4:]
+    nowhere = np.concatenate([place, np.zeros_like(place)], axis=1)
+    mean = np.where(seen[:, 4:] > 0, mean, nowhere)
+    column, row, height, visible = (np.asarray(part, np.float32) for part in mean.T)
+    n = np.float32(samples)
+    return Traced(rgb, cover / n, column, row, height, visible, seen[:, 4] / n)
+
+
+def _patch(curvature: Array, view: Array) -> Patch:
+    flat = np.sqrt(view[:, 0] * view[:, 0] + view[:, 1] * view[:, 1])
+    straight = (curvature == 0) | (flat < 1e-6)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ex, ey = np.where(straight, 1, view[:, 0] / flat), np.where(straight, 0, view[:, 1] / flat)
+    return Patch(curvature, ex, ey)
+
+
+def _spread(query: NDArray[np.uint32], index: int, samples: int, seed: int) -> Floats:
+    """(b, 2) of a Gaussian of deviation 1: strata of equal probability, turned by golden angles."""
+    one = (np.float32(index) + _uniform(query, index, 0, seed)) / np.float32(samples)
+    with np.errstate(over="ignore"):
+        turned = _mixed(query, 1, 1, seed) + np.uint32(index * 2654435769 & 0xFFFFFFFF)
+    angle = np.float32(2 * np.pi) * _to_unit(turned)
+    radius = np.sqrt(-2 * np.log1p(-np.minimum(one, np.float32(0.99999994))))
+    return radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _sample(
     relief: Geometry,
-    place: Array,
-    light: Array,
-    view: Array,
+    patch: Patch,
+    place: Floats,
+    light: Floats,
+    view: Floats,
     bounces: int,
     query: NDArray[np.uint32],
     index: int,
     seed: int,
-) -> tuple[Array, Array]:
-    """One ray a query: reflectance (b, c), and (b, 5) opacity, column, row, height, visibility."""
-    up = relief.height.max() + LIFT
-    v = _lifted(view)
-    start = place + v[:, :2] * _ROWS_DOWN[:2] * (up / v[:, 2:])
-    column, row, z, _ = _march(relief, start[:, 0], start[:, 1], np.full(len(place), up), -v)
-    surface = _Surface.at(relief, column, row)
+) -> tuple[Floats, Floats]:
+    """One ray a query: reflectance (b, c); (b, 6) opacity, column, row, height, visible, met."""
+    hit = _looked(relief, patch, place, _lifted(view))
+    surface = _Surface.at(relief, patch, hit.at)
+    at, alive = hit.at, hit.found
+    where = np.stack(
+        [surface.opacity, at.i + at.a, at.j + at.b, at.z, np.zeros_like(at.z), alive], axis=1
+    ).astype(np.float32)
+    # The plane goes on for ever and hides every light below its horizon; a cylinder does not.
+    alive = alive & (surface.opacity > 0) & ((patch.k != 0) | (light[:, 2] > 0))
     rgb = np.zeros((len(place), relief.channels), np.float32)
-    visible = np.zeros(len(place), np.float32)
-    where = np.stack([surface.opacity, column, row, z, visible], axis=1).astype(np.float32)
-    alive = (surface.opacity > 0) & (light[:, 2] > 0)
     throughput = np.ones_like(rgb)
-    outgoing = view
+    light, outgoing = patch.turned(light, hit.turn), patch.turned(view, hit.turn)
     for bounce in range(bounces + 1):
         faces = alive & (_dot(surface.normal, light) > 0)
-        lit = np.flatnonzero(faces)
-        if lit.size:
-            free = ~_occluded(
-                relief, column[lit], row[lit], z[lit], surface.normal[lit], light[lit]
-            )
-            lit = lit[free]
-            if bounce == 0:
-                where[lit, 4] = 1
-            rgb[lit] += throughput[lit] * surface.take(lit).shaded(light[lit], outgoing[lit])
+        towards = np.where((patch.k == 0)[:, None], _lifted(light), light)
+        start = _above(at, surface.normal)
+        lit = faces & ~sent(relief, patch, start, towards, faces).found
+        if bounce == 0:
+            where[lit, 4] = 1
+        rgb[lit] += throughput[lit] * surface.take(lit).shaded(light[lit], outgoing[lit])
         if bounce == bounces:
             break
-        u1 = _uniform(query, index, 16 + 2 * bounce, seed)
-        u2 = _uniform(query, index, 17 + 2 * bounce, seed)
-        radius, angle = np.sqrt(u1), np.float32(2 * np.pi) * u2
-        along = (radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - u1))
-        axes = (surface.tangent, surface.bitangent, surface.normal)
-        onward: Array = np.sum([s[:, None] * a for s, a in zip(along, axes, strict=True)], axis=0)
-        gain = surface.shaded(onward, outgoing)
+        onward = _onward(surface, query, index, bounce, seed)
         cosine = np.maximum(_dot(surface.normal, onward), np.float32(1e-6))
-        throughput = throughput * gain / cosine[:, None]
-        n = surface.normal
-        column, row, z, found = _march(
-            relief, column + LIFT * n[:, 0], row - LIFT * n[:, 1], z + LIFT * n[:, 2], onward, alive
-        )
-        surface = _Surface.at(relief, column, row)
-        outgoing = -onward
-        alive = alive & found & (_dot(surface.normal, outgoing) > 0)
+        throughput = throughput * surface.shaded(onward, outgoing) / cosine[:, None]
+        hit = sent(relief, patch, start, onward, alive)
+        at, surface = hit.at, _Surface.at(relief, patch, hit.at)
+        light, outgoing = patch.turned(light, hit.turn), patch.turned(-onward, hit.turn)
+        alive = alive & hit.found & (_dot(surface.normal, outgoing) > 0)
     return rgb, where
+
+
+def _looked(relief: Geometry, patch: Patch, place: Floats, v: Floats) -> Hit:
+    """View rays through places on z = 0, from where they come into the layer of the relief."""
+    count, up = len(place), relief.highest + np.float32(LIFT)
+    slope = up / v[:, 2]
+    level = np.full(count, up, np.float32)
+    start = Point.over(place[:, 0] + v[:, 0] * slope, place[:, 1] - v[:, 1] * slope, level)
+    hit = sent(relief, patch, start, -v, patch.k == 0)
+    curved = np.flatnonzero(patch.k != 0)
+    # |centre + t v| = 1/k + up; a concave patch may have no such t: the ray begins half-way across.
+    p, v = patch.take(curved), v[curved]
+    c = up * (2 + p.k * up)
+    square = v[:, 2] * v[:, 2] + p.k * c
+    zero = Point.over(place[curved, 0], place[curved, 1], np.zeros(len(curved), np.float32))
+    with np.errstate(invalid="ignore"):
+        t = np.where(square < 0, -v[:, 2] / p.k, c / (v[:, 2] + np.sqrt(square)))
+    comes = ~((square < 0) & (p.k > 0))
+    rows = curved[comes]
+    p, line = p.take(comes), Line.of(p, zero.z, v).take(comes)
+    begin = line.at(t[comes])
+    from_ = zero.take(comes).moved(*p.steps(begin.s, begin.a), begin.rise)
+    found = bent(relief, p, from_, p.turned(-v[comes], begin.turn))
+    hit.found[rows] = found.found
+    hit.at.put(rows, found.at)
+    (c0, s0), (c1, s1) = begin.turn.T, found.turn.T
+    hit.turn[rows] = np.stack([c0 * c1 - s0 * s1, s0 * c1 + c0 * s1], axis=1)
+    return hit
+
+
+def _onward(
+    surface: _Surface, query: NDArray[np.uint32], index: int, bounce: int, seed: int
+) -> Floats:
+    """(b, 3) directions, cosine-weighted about the normal."""
+    u1 = _uniform(query, index, 16 + 2 * bounce, seed)
+    u2 = _uniform(query, index, 17 + 2 * bounce, seed)
+    radius, angle = np.sqrt(u1), np.float32(2 * np.pi) * u2
+    along = (radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - u1))
+    axes = (surface.tangent, surface.bitangent, surface.normal)
+    parts = [s[:, None] * a for s, a in zip(along, axes, strict=True)]
+    return parts[0] + parts[1] + parts[2]
+
+
+def _above(at: Point, normal: Floats) -> Point:
+    lift = np.float32(LIFT)
+    return at.moved(lift * normal[:, 0], -lift * normal[:, 1], lift * normal[:, 2])
 
 
 class _Surface(NamedTuple):
     """What a ray meets: (b, 3) frame and (b, ...) reflectance."""
 
-    normal: Array
-    tangent: Array
-    bitangent: Array
-    albedo: Array
-    specular: Array
-    along: Array
-    across: Array
-    opacity: Array
+    normal: Floats
+    tangent: Floats
+    bitangent: Floats
+    albedo: Floats
+    specular: Floats
+    along: Floats
+    across: Floats
+    opacity: Floats
 
     @staticmethod
-    def at(relief: Geometry, column: Array, row: Array) -> _Surface:
-        """The surface under (b,) columns and rows."""
-        corners, a, b = _cell(relief, column, row)
-        h00, h10, h01, h11 = (relief.height[j, i] for j, i in corners)
-        twist = h11 - h10 - h01 + h00
-        ones = np.ones_like(a)
-        slope = np.stack([-(h10 - h00 + twist * b), h01 - h00 + twist * a, ones], axis=1)
-        normal = _unit(slope)
-        weights = ((1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b)
-        maps = [relief.maps[j, i] for j, i in corners]
-        mixed: Array = np.sum([w[:, None] * m for w, m in zip(weights, maps, strict=True)], axis=0)
+    def at(relief: Geometry, patch: Patch, at: Point) -> _Surface:
+        """The surface at points of the relief."""
+        a, b = at.a[:, None], at.b[:, None]
+        around = corners(relief, at.i, at.j)
+        m00, m10, m01, m11 = maps = [relief.planes(j, i) for j, i in around]
+        # By differences: four equal values give just that value.
+        upper, lower = m10 - m00, m11 - m01
+        mixed = m00 + a * upper + b * (m01 - m00 + a * (lower - upper))
         c = relief.channels
-        nearest = (a >= 0.5).astype(int) + 2 * (b >= 0.5)
+        nearest = (at.a >= 0.5).astype(int) + 2 * (at.b >= 0.5)
         angle = np.choose(nearest, [m[:, 2 * c + 2] for m in maps])
-        flat = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
-        tangent = _unit(flat - normal * _dot(flat, normal)[:, None])
+        h00, h10, h01, h11 = (relief.height[j, i] for j, i in around)
+        twist = h11 - h10 - h01 + h00
+        slope = np.stack([-(h10 - h00 + twist * at.b), h01 - h00 + twist * at.a], axis=1)
+        flat = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        # A cylinder is wider at height z by 1 + k z.
+        wide = 1 + patch.k * at.z
+        e = np.stack([patch.ex, patch.ey], axis=1)
+        slope = slope + e * (_dot(slope, e) * (1 / wide - 1))[:, None]
+        flat = flat + e * (_dot(flat, e) * (wide - 1))[:, None]
+        normal = _unit(np.column_stack([slope, np.ones_like(wide)]))
+        tangent = np.column_stack([flat, np.zeros_like(wide)])
+        tangent = _unit(tangent - normal * _dot(tangent, normal)[:, None])
         return _Surface(
             normal, tangent, np.cross(normal, tangent), mixed[:, :c], mixed[:, c : 2 * c],
-            mixed[:, 2 * c], mixed[:, 2 * c + 1], np.minimum(mixed[:, 2 * c + 3], 1),
+            mixed[:, 2 * c], mixed[:, 2 * c + 1], np.clip(mixed[:, 2 * c + 3], 0, 1),
         )  # fmt: skip
 
-    def take(self, rows: NDArray[np.intp]) -> _Surface:
+    def take(self, rows: Bools) -> _Surface:
         return _Surface(*(part[rows] for part in self))
 
-    def shaded(self, light: Array, view: Array) -> Array:
+    def shaded(self, light: Floats, view: Floats) -> Floats:
         """(b, c) pi f (n . light): Lambert under GGX, Smith's masking, Schlick's Fresnel."""
         nl = _dot(self.normal, light)
         nv = np.maximum(_dot(self.normal, view), 1e-4)
@@ -236,150 +298,59 @@ class _Surface(NamedTuple):
         nh = np.maximum(_dot(self.normal, half), 0)
         vh = np.maximum(_dot(view, half), 0)
         hx, hy = _dot(self.tangent, half) / self.along, _dot(self.bitangent, half) / self.across
-        lobe = 1 / (np.pi * self.along * self.across * (hx**2 + hy**2 + nh**2) ** 2)
         masks = []
         for direction, cosine in ((light, nl), (view, nv)):
             x = self.along * _dot(self.tangent, direction)
             y = self.across * _dot(self.bitangent, direction)
-            masks.append(cosine + np.sqrt(cosine**2 + x**2 + y**2))
+            masks.append(cosine + np.sqrt(cosine * cosine + x * x + y * y))
+        d = hx * hx + hy * hy + nh * nh
+        with np.errstate(divide="ignore"):
+            lobe = 1 / (self.along * self.across * (d * d) * (masks[0] * masks[1]))
         f0 = self.specular
         f90 = np.minimum(1, 50 * f0)
         rest = (1 - _schlick(f0, f90, nl)) * (1 - _schlick(f0, f90, nv))
-        gloss = (np.pi * lobe / (masks[0] * masks[1]))[:, None] * _schlick(f0, f90, vh)
-        return np.where(nl[:, None] > 0, (self.albedo * rest + gloss) * nl[:, None], 0)
+        with np.errstate(invalid="ignore"):
+            pi_f = self.albedo * rest + lobe[:, None] * _schlick(f0, f90, vh)
+            return np.where(nl[:, None] > 0, pi_f * nl[:, None], 0)
 
 
-def _march(
-    relief: Geometry,
-    column: Array,
-    row: Array,
-    z: Array,
-    direction: Array,
-    alive: NDArray[np.bool_] | None = None,
-) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """First crossing from above to below: (b,) column, row, height, and whether there is one."""
-    lowest, highest = relief.height.min(), relief.height.max()
-    i, j = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
-    a, b = (column - i).astype(np.float32), (row - j).astype(np.float32)
-    z = z.astype(np.float32).copy()
-    d = direction.astype(np.float32) * _ROWS_DOWN
-    found = np.zeros(len(z), bool)
-    going = np.arange(len(z)) if alive is None else np.flatnonzero(alive)
-    flat = np.hypot(d[:, 0], d[:, 1])
-    reach = (highest - lowest) / np.maximum(np.abs(d[:, 2]), 1e-6) * flat
-    most = 64 + 2 * int(min(1e6, float(reach[going].max(initial=0))) + 2)
-    for _ in range(most):
-        if not going.size:
-            break
-        ai, bi, zi, (da, db, dz) = a[going], b[going], z[going], d[going].T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ta = np.where(da > 0, (1 - ai) / da, np.where(da < 0, -ai / da, np.inf))
-            tb = np.where(db > 0, (1 - bi) / db, np.where(db < 0, -bi / db, np.inf))
-            ta, tb = np.maximum(ta, 0), np.maximum(tb, 0)
-            leave = np.minimum(ta, tb)
-            vertical = ~np.isfinite(leave)
-            through = np.where(dz < 0, (zi - lowest + 1) / -dz, (highest - zi + 1) / dz)
-            leave = np.where(vertical, through, leave)
-        t = _crossing(relief, (i[going], j[going]), ai, bi, zi, da, db, dz)
-        hit = t <= leave
-        t = np.where(hit, t, leave)
-        zi = zi + dz * t
-        under = ~hit & (dz < 0) & (zi < lowest)
-        gone = ~hit & (vertical | ((dz > 0) & (zi > highest)) | under)
-        found[going] = hit | (under & ~vertical)
-        z[going] = np.where(under, lowest, zi)
-        ai, bi = ai + da * t, bi + db * t
-        stay = hit | gone
-        first = ~stay & (ta <= tb)
-        second = ~stay & ~first
-        i[going] += np.where(first, np.where(da > 0, 1, -1), 0)
-        j[going] += np.where(second, np.where(db > 0, 1, -1), 0)
-        a[going] = np.where(first, np.where(da > 0, 0, 1), np.clip(ai, 0, 1))
-        b[going] = np.where(second, np.where(db > 0, 0, 1), np.clip(bi, 0, 1))
-        going = going[~stay]
-    return i + a, j + b, z, found
-
-
-def _crossing(
-    relief: Geometry,
-    cell: tuple[NDArray[np.int64], NDArray[np.int64]],
-    a: Array,
-    b: Array,
-    z: Array,
-    da: Array,
-    db: Array,
-    dz: Array,
-) -> Array:
-    """Where along each ray its cell's bilinear height is met first; infinite where it is not."""
-    i, j = cell
-    h00, h10, h01, h11 = (relief.height[r, c] for r, c in _corners(relief, i, j))
-    ha, hb, hab = h10 - h00, h01 - h00, h11 - h10 - h01 + h00
-    q0 = z - (h00 + ha * a + hb * b + hab * a * b)
-    q1 = dz - ha * da - hb * db - hab * (a * db + b * da)
-    q2 = -hab * da * db
-    with np.errstate(invalid="ignore", divide="ignore"):
-        below = -q1 + np.sqrt(q1 * q1 - 4 * q2 * q0)
-        t = np.where(below > 0, 2 * q0 / below, np.inf)
-    return np.where(q0 <= 0, 0, t)
-
-
-def _occluded(
-    relief: Geometry, column: Array, row: Array, z: Array, normal: Array, light: Array
-) -> NDArray[np.bool_]:
-    start = (column + LIFT * normal[:, 0], row - LIFT * normal[:, 1], z + LIFT * normal[:, 2])
-    return _march(relief, *start, _lifted(light))[3]
-
-
-def _cell(
-    relief: Geometry, column: Array, row: Array
-) -> tuple[list[tuple[NDArray[np.int64], NDArray[np.int64]]], Array, Array]:
-    i, j = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
-    return _corners(relief, i, j), (column - i).astype(np.float32), (row - j).astype(np.float32)
-
-
-def _corners(
-    relief: Geometry, i: NDArray[np.int64], j: NDArray[np.int64]
-) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """(row, column) of the corners 00, 10, 01, 11 of cells."""
-    h, w = relief.height.shape
-    if relief.wrap:
-        cols, rows = (i % w, (i + 1) % w), (j % h, (j + 1) % h)
-    else:
-        cols = np.clip(i, 0, w - 1), np.clip(i + 1, 0, w - 1)
-        rows = np.clip(j, 0, h - 1), np.clip(j + 1, 0, h - 1)
-    return [(r, c) for r in rows for c in cols]
-
-
-def _lifted(direction: Array) -> Array:
+def _lifted(direction: Floats) -> Floats:
     """Directions no closer to the horizon than `STEEPEST`."""
-    flat = np.hypot(direction[:, 0], direction[:, 1])
-    keep = np.sqrt(1 - STEEPEST**2) / np.maximum(flat, 1e-15)
-    low = direction[:, :2] * keep[:, None]
-    bent = np.column_stack([low, np.full(len(low), STEEPEST)])
-    return np.where(direction[:, 2:] >= STEEPEST, direction, bent).astype(np.float32)
+    flat = np.sqrt(np.maximum(_dot(direction[:, :2], direction[:, :2]), 1e-30))
+    low = direction[:, :2] * (np.float32(np.sqrt(1 - STEEPEST**2)) / flat)[:, None]
+    lifted = np.column_stack([low, np.full(len(low), STEEPEST, np.float32)])
+    return np.where(direction[:, 2:] >= STEEPEST, direction, lifted)
 
 
-def _schlick(f0: Array, f90: Array, cosine: Array) -> Array:
-    return f0 + (f90 - f0) * ((1 - cosine) ** 5)[:, None]
+def _schlick(f0: Floats, f90: Floats, cosine: Floats) -> Floats:
+    m = 1 - cosine
+    return f0 + (f90 - f0) * ((m * m) * (m * m) * m)[:, None]
 
 
-def _dot(a: Array, b: Array) -> Array:
+def _dot(a: Floats, b: Floats) -> Floats:
     return np.einsum("ij,ij->i", a, b)
 
 
-def _unit(v: Array) -> Array:
+def _unit(v: Floats) -> Floats:
     return v / np.sqrt(np.maximum(_dot(v, v), np.float32(1e-30)))[:, None]
 
 
-def _uniform(query: NDArray[np.uint32], index: int, dimension: int, seed: int) -> Array:
+def _uniform(query: NDArray[np.uint32], index: int, dimension: int, seed: int) -> Floats:
     """Counter-based random numbers in (0, 1): the same for a query whatever else is traced."""
+    return _to_unit(_mixed(query, index, dimension, seed))
+
+
+def _to_unit(x: NDArray[np.uint32]) -> Floats:
+    return ((x >> np.uint32(8)).astype(np.float32) + np.float32(0.5)) * np.float32(2**-24)
+
+
+def _mixed(query: NDArray[np.uint32], index: int, dimension: int, seed: int) -> NDArray[np.uint32]:
     with np.errstate(over="ignore"):
         inner = _hash(np.uint32(dimension) ^ _hash(np.uint32(seed & 0xFFFFFFFF)))
-        mixed = _hash(query ^ _hash(np.uint32(index) ^ inner))
-    return (((mixed >> np.uint32(8)) + np.float32(0.5)) * np.float32(2**-24)).astype(np.float32)
+        return _hash(query ^ _hash(np.uint32(index) ^ inner))
 
 
-def _hash(x: NDArray[np.uint32] | np.uint32) -> NDArray[np.uint32]:
+def _hash(x: NDArray[np.uint32] | np.uint32) -> Any:
     state = np.asarray(x, np.uint32) * np.uint32(747796405) + np.uint32(2891336453)
     word = ((state >> ((state >> np.uint32(28)) + np.uint32(4))) ^ state) * np.uint32(277803737)
     return (word >> np.uint32(22)) ^ word

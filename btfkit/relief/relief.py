@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, final
 
 import numpy as np
@@ -93,6 +93,12 @@ class Relief:
     def aspect(self) -> float:
         """Tile width / tile height."""
         return self.height.shape[1] / self.height.shape[0]
+
+    def under_surface(self) -> tuple[Relief, float]:
+        """The same with its highest point at 0, for a bounding surface, and what was added."""
+        shift = -float(self.height.max())
+        height = self.height - self.height.max()
+        return replace(self, height=height), shift
 
     def normals(self) -> Array:
         """(h, w, 3) unit normals at texel centres, by central differences, surface frame."""
