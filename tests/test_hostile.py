@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -18,6 +19,13 @@ import btfkit
 from btfkit import io
 from btfkit.btf import BTF
 from btfkit.errors import BtfkitError, FormatError
+from btfkit.io import queryfile
+from btfkit.materials import file as model_file
+from btfkit.materials.base import Header
+from btfkit.materials.lambert import Lambert, LambertSpec
+from btfkit.queries import QuerySet
+from btfkit.relief import file as relief_file
+from btfkit.relief import procedural
 
 READABLE = [name for name in io.FORMATS if name != "axf"]
 # The same damage every time: a surprise belongs to whoever changes a reader.
@@ -196,3 +204,51 @@ def test_a_jpeg_named_png_and_a_png_named_jpg_are_what_they_hold(tmp_path: Path)
     for file in path.rglob("*.jpg"):
         file.rename(file.with_suffix(".png"))
     np.testing.assert_array_equal(btfkit.open(path).texture(0), before)
+
+
+def _queries(path: Path) -> Callable[[Path], object]:
+    rng = np.random.default_rng(0)
+    up = np.tile(np.array([0, 0, 1], np.float32), (20, 1))
+    uv, rgb = rng.random((20, 2), np.float32), rng.random((20, 3), np.float32)
+    queryfile.write(QuerySet(uv=uv, light=up, view=up, rgb=rgb, size=(4, 5)), path)
+    return queryfile.read
+
+
+def _relief(path: Path) -> Callable[[Path], object]:
+    relief_file.write(procedural.make("cobbles", 8), path)
+    return relief_file.read
+
+
+def _model(path: Path) -> Callable[[Path], object]:
+    albedo = np.random.default_rng(0).random((4, 4, 3)).astype(np.float32)
+    model_file.save(Lambert(LambertSpec((4, 4)), {"texture": albedo}, Header((4, 4))), path)
+    return model_file.load
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("file", "write"),
+    [("q.npz", _queries), ("r.exr", _relief), ("m.lambert.safetensors", _model)],
+)
+def test_damaged_queries_reliefs_and_models_are_told_in_one_line(
+    file: str, write: Callable[[Path], Callable[[Path], object]], tmp_path: Path
+) -> None:
+    read = write(tmp_path / file)
+    read(tmp_path / file)
+
+    @settings(max_examples=150, **FUZZ)
+    @given(st.lists(mutations.damages(), min_size=1, max_size=2))
+    def law(hurt: list[mutations.Damage]) -> None:
+        with mutations.damaged([tmp_path / file], hurt), warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            try:
+                read(tmp_path / file)
+            except HARMLESS as error:
+                message = str(error)
+            else:
+                return
+        assert file in message
+        assert "\n" not in message
+        assert len(message) < 1000
+
+    law()

@@ -46,7 +46,9 @@ def read(path: Path) -> QuerySet:
         raise
     except (OSError, ValueError, EOFError, KeyError, MemoryError, zipfile.BadZipFile) as error:
         raise FormatError(
-            path, f"not a readable query file ({error})", remedy="write it with numpy.savez"
+            path,
+            f"not a readable query file ({str(error)[:200]})",
+            remedy="write it with numpy.savez",
         ) from error
     missing = [name for name in ("uv", "light", "view") if name not in found]
     if missing:

@@ -38,7 +38,7 @@ def read(path: Path) -> Relief:
     if "Z" not in maps:
         raise FormatError(path, f"no channel Z; it has {', '.join(channels)}")
     h, w = maps["Z"].shape
-    unit = attributes.get(_PREFIX + "unit", "texel")
+    unit = str(attributes.get(_PREFIX + "unit", "texel"))
     if unit not in ("tile", "texel"):
         raise FormatError(path, f"unit {unit!r}; expected tile or texel")
     height = maps["Z"] if unit == "tile" else maps["Z"] / np.float32(w)
