@@ -290,7 +290,10 @@ def test_a_material_without_levels_is_asked_at_its_finest_and_sampled_more() -> 
     scene = Scene(fine, shape_of("plane"), ABOVE[None])
     assert enough_samples(scene, ABOVE, (16, 16)) == 16
     assert enough_samples(scene, ABOVE, (64, 64)) == 1
-    assert enough_samples(Scene(fine, shape_of("sphere"), ABOVE[None]), ABOVE, (256, 256)) == 4
+    ball = shape_of("sphere")
+    assert enough_samples(Scene(fine, ball, ABOVE[None]), ABOVE, (256, 256)) == 4
+    sky = Environment(np.ones((1, 1, 3)))
+    assert enough_samples(Scene(fine, ball, ABOVE[None], sky), ABOVE, (256, 256)) == 64
 
 
 def test_curvature_of_sphere_and_cylinder_is_told_in_tile_widths() -> None:
@@ -531,11 +534,9 @@ def test_only_what_is_seen_and_lit_is_asked() -> None:
 def test_holes_are_holes_on_the_dark_side_too() -> None:
     holes = np.ones((8, 8))
     holes[:, 2:4] = 0
-    covers = [
-        pictured(Painted(white(8), holes), "plane", light, size=(8, 8)).cover
-        for light in (ABOVE, -ABOVE)
-    ]
-    np.testing.assert_array_equal(covers, [holes, holes])
+    dark = pictured(Painted(white(8), holes), "plane", -ABOVE, size=(8, 8))
+    np.testing.assert_array_equal(dark.cover, holes)
+    np.testing.assert_array_equal(dark.radiance, 0)
 
 
 def test_answers_that_are_not_finite_are_black_and_counted() -> None:
@@ -734,6 +735,19 @@ def test_a_plane_shows_the_textures_of_a_store_as_they_are(store: Path, tmp_path
         # float16 textures; float32 uv of texel centres.
         np.testing.assert_allclose(values[..., :3], btf.texture(index), atol=1e-4, rtol=1e-3)
         np.testing.assert_array_equal(values[..., 3], 1)
+
+
+def test_a_small_store_in_memory_looks_as_it_does_from_disk(store: Path, tmp_path: Path) -> None:
+    from btfkit import open as open_btf
+    from btfkit.materials.interpolation import Interpolation
+
+    out = tmp_path / "a.exr"
+    options = ("--shape", "sphere", "--light", "40,45", "--size", "16x16", "--spp", 1)
+    assert call("render", store, "-o", out, *options) == 0
+    lazy = Interpolation.of(open_btf(store))
+    shape = shape_of("sphere", aspect=20 / 12)
+    seen = pictured(lazy, shape, towards(40, 45), size=(16, 16))
+    np.testing.assert_array_equal(read_exr(out)[0][..., :3], seen.radiance)
 
 
 def test_an_exr_says_what_it_shows(
