@@ -512,7 +512,7 @@ def test_a_row_past_the_silhouette_is_nothing_seen_nowhere() -> None:
 
 
 def test_curvature_that_reaches_the_axis_and_reliefs_above_their_surface_are_refused() -> None:
-    with pytest.raises(ValueError, match="curvature 20 / tile bends a relief.*at most 18 here"):
+    with pytest.raises(ValueError, match=r"curvature 20 / tile bends a relief.*at most 18 here"):
         trace.answer(_sunk(0.05), [0.5, 0.5], UP, UP, 0.5, 20.0)
     with pytest.raises(ValueError, match=r"stands 3.2 texels above.*take relief.under_surface"):
         trace.silhouette(surface(np.full((8, 64), 0.05)), [0.5, 0.5], 0.0, 1.0)

@@ -3,14 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, final
 
 import click
 
 from btfkit.cli.bar import Bar
-from btfkit.cli.options import force_option, out_option, seed_option
+from btfkit.cli.options import NumbersType, force_option, out_option, seed_option
 from btfkit.cli.outcome import Outcome, verb
 
 KINDS = ("relief", "zarr", "ubo2003", "ubo2014", "utia", "manifest", "queries")
+
+
+@final
+class FloatsType(click.ParamType[tuple[float, ...]]):
+    """Any number of positive numbers between commas."""
+
+    name = "A,B,..."
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        try:
+            numbers = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            self.fail(f"{value!r} is no list of numbers", param, ctx)
+        if not all(0 < number < 1e6 for number in numbers):
+            self.fail(f"{value!r} holds numbers that are not between 0 and 1e6", param, ctx)
+        return numbers
 
 
 @verb("synth", example="btfkit synth woven -o woven.btf.zarr --as zarr --size 128")
@@ -23,8 +42,25 @@ KINDS = ("relief", "zarr", "ubo2003", "ubo2014", "utia", "manifest", "queries")
 @click.option("--lights", default="bonn81", show_default=True, help="bonn81, bonn151 or a number.")
 @click.option("--relief", "relief_texels", type=float, help="Height of the structure, texels.")
 @click.option("--bounces", type=click.IntRange(0, 16), default=0, help="Interreflections.")
-@click.option("--samples", type=click.IntRange(1, 4096), default=4, help="Rays a texel.")
+@click.option(
+    "--samples",
+    type=click.IntRange(1, 4096),
+    help="Rays a texel or query.  [default: 4; queries: 16]",
+)
+@click.option("--clamp", is_flag=True, help="A sample that does not tile.")
 @click.option("--count", type=click.IntRange(min=1), default=1_000_000, help="Queries to answer.")
+@click.option(
+    "--footprints",
+    type=FloatsType(),
+    default="0.5",
+    show_default=True,
+    help="Queries: footprints to draw from, texels.",
+)
+@click.option(
+    "--curvature",
+    type=NumbersType("LOW,HIGH", float),
+    help="Queries: on cylinders of such |curvature|, 1/tile width, and on the plane.",
+)
 @seed_option
 @force_option
 def synth_verb(
@@ -39,8 +75,11 @@ def synth_verb(
     lights: str,
     relief_texels: float | None,
     bounces: int,
-    samples: int,
+    samples: int | None,
+    clamp: bool,
     count: int,
+    footprints: tuple[float, ...],
+    curvature: tuple[float, float] | None,
     seed: int,
     force: bool,
 ) -> Outcome:
@@ -49,29 +88,38 @@ def synth_verb(
     What it writes is synthetic, and says so.
     """
     from btfkit.relief import procedural
-    from btfkit.relief.synth import synth_btf
+    from btfkit.relief.synth import relief_btf
 
     if listing or name is None:
-        return Outcome("\n".join(procedural.CATALOGUE), {"materials": list(procedural.CATALOGUE)})
+        about = procedural.described()
+        lines = [f"{each:<11}{line}" for each, line in about.items()]
+        return Outcome("\n".join(lines), {"materials": list(about), "about": about})
     if out is None:
         raise click.UsageError("Missing option '-o' / '--out'.")
-    if kind in ("relief", "queries"):
-        relief = procedural.make(name, size, relief_texels=relief_texels, seed=seed)
-        if kind == "relief":
-            from btfkit.relief.file import write
+    if kind != "queries" and curvature is not None:
+        raise click.UsageError("--curvature is for --as queries")
+    relief = procedural.make(
+        name, size, relief_texels=relief_texels, seed=seed, wrap="clamp" if clamp else "wrap"
+    )
+    if kind == "relief":
+        from btfkit.relief.file import write
 
-            write(relief, out, force=force)
-        else:
-            from btfkit.io import queryfile
-            from btfkit.relief.trace import random_queries
+        write(relief, out, force=force)
+    elif kind == "queries":
+        from btfkit.io import queryfile
+        from btfkit.relief.trace import SAMPLES, random_queries
 
-            queries = random_queries(relief, count, seed=seed, bounces=bounces)
-            queryfile.write(queries, out, force=force)
-    else:
-        btf = synth_btf(
-            name, size=size, lights=lights, views=views, relief_texels=relief_texels,
-            samples=samples, bounces=bounces, seed=seed,
+        queries = random_queries(
+            relief, count, seed=seed, bounces=bounces, samples=samples or SAMPLES,
+            footprints=footprints, curvatures=curvature,
+            # On cylinders the silhouettes are the point, and they lie near the horizon.
+            lowest_z=0.1 if curvature is None else 0.02,
         )  # fmt: skip
+        queryfile.write(queries, out, force=force)
+    else:
+        btf = relief_btf(
+            relief, lights=lights, views=views, samples=samples or 4, bounces=bounces, seed=seed
+        )
         if kind == "zarr":
             from btfkit.io import store_write
 

@@ -178,7 +178,7 @@ def _sample(
     # The plane goes on for ever and hides every light below its horizon; a cylinder does not.
     alive = alive & (surface.opacity > 0) & ((patch.k != 0) | (light[:, 2] > 0))
     rgb = np.zeros((len(place), relief.channels), np.float32)
-    throughput = np.ones_like(rgb)
+    throughput: Floats = np.ones_like(rgb)
     light, outgoing = patch.turned(light, hit.turn), patch.turned(view, hit.turn)
     for bounce in range(bounces + 1):
         faces = alive & (_dot(surface.normal, light) > 0)

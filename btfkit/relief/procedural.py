@@ -8,17 +8,26 @@ relief read into their brightness is invented, not measured.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.btf import Wrap
 from btfkit.relief.relief import Relief
 
 Floats = NDArray[np.floating]
+# Texels a side, height of the structure in tile widths, randomness -> one tile.
+Maker = Callable[[int, float, np.random.Generator], Relief]
 
 
 def make(
-    name: str, size: int = 128, *, relief_texels: float | None = None, seed: int = 0
+    name: str,
+    size: int = 128,
+    *,
+    relief_texels: float | None = None,
+    seed: int = 0,
+    wrap: Wrap = "wrap",
 ) -> Relief:
     """A material of the catalogue.
 
@@ -27,6 +36,7 @@ def make(
         size: texels a side.
         relief_texels: height of its structure, texels; None takes its own default.
         seed: of what is random in it.
+        wrap: "wrap" for a tile; "clamp" for a sample that does not tile, cut from a larger one.
 
     Raises:
         ValueError: no such material, or a size without structure.
@@ -37,7 +47,35 @@ def make(
         raise ValueError(f"size = {size}; expected at least 8 texels")
     function, default = CATALOGUE[name]
     texels = default if relief_texels is None else relief_texels
-    return function(size, texels / size, np.random.default_rng(seed))
+    if wrap == "wrap":
+        return function(size, texels / size, np.random.default_rng(seed))
+    return _corner(_larger(function, size, texels, seed), size)
+
+
+def described() -> dict[str, str]:
+    """One line about each material."""
+    return {name: (made.__doc__ or "").split("\n")[0] for name, (made, _) in CATALOGUE.items()}
+
+
+# How much larger the tile is that a sample is cut from: no structure repeats in such a part of it.
+_LARGER = 1.37
+
+
+def _larger(function: Maker, size: int, texels: float, seed: int) -> Relief:
+    n = round(size * _LARGER)
+    return function(n, texels / n, np.random.default_rng(seed))
+
+
+def _corner(tile: Relief, size: int) -> Relief:
+    def cut(values: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+        return None if values is None else values[:size, :size]
+
+    height = tile.height[:size, :size] * np.float32(tile.size[1] / size)
+    return replace(
+        tile, height=height, albedo=tile.albedo[:size, :size], specular=tile.specular[:size, :size],
+        roughness=tile.roughness[:size, :size], roughness_across=cut(tile.roughness_across),
+        tangent=cut(tile.tangent), opacity=cut(tile.opacity), wrap="clamp",
+    )  # fmt: skip
 
 
 def cobbles(size: int, depth: float, rng: np.random.Generator) -> Relief:
@@ -51,7 +89,9 @@ def cobbles(size: int, depth: float, rng: np.random.Generator) -> Relief:
     tilt = rng.normal(0, 0.15, count * count)[nearest]
     height = depth * dome * (0.85 + tilt) + 0.03 * depth * _noise(size, 16, rng)
     stone = _smooth(edge, 0.12, 0.3)
-    tint = rng.uniform([0.25, 0.2, 0.16], [0.62, 0.55, 0.5], (count * count, 3))[nearest]
+    sandstone, granite = np.array([1.0, 0.84, 0.66]), np.array([0.84, 0.9, 1.0])
+    bright, warm = rng.uniform(0.16, 0.6, (count**2, 1)), rng.uniform(0, 1, (count**2, 1))
+    tint = (bright * _mix(granite, sandstone, warm))[nearest]
     grain = 1 + 0.18 * _noise(size, 24, rng)[..., None]
     sand = np.array([0.36, 0.3, 0.22]) * (1 + 0.25 * _noise(size, 40, rng)[..., None])
     albedo = _mix(sand, tint * grain, stone[..., None])
@@ -87,20 +127,34 @@ def woven(size: int, depth: float, rng: np.random.Generator) -> Relief:
 
 
 def knit(size: int, depth: float, rng: np.random.Generator) -> Relief:
-    """Stockinette: columns of V-shaped stitches."""
-    wales = max(4, size // 24 // 2 * 2)
+    """Stockinette: columns of V-shaped stitches, each drawn through the one below."""
+    wales = max(4, size // 24)
+    courses = round(wales * 1.25)
     v, u = _grid(size)
-    x, y = u * wales, v * wales * 1.0
-    across = x % 1 - 0.5
-    lean = np.abs(across) * 1.4
-    along = (y + lean) % 1
-    leg = np.exp(-(((np.abs(across) - 0.24) / 0.15) ** 2))
-    twist = 0.75 + 0.25 * np.sin(2 * np.pi * (along * 3 + np.abs(across) * 2))
-    bow = np.sin(np.pi * along) ** 0.7
-    height = depth * leg * (0.45 + 0.55 * bow) * twist
-    shade = 1 + 0.15 * _noise(size, 32, rng) + 0.25 * (leg - 0.6)
-    albedo = np.array([0.5, 0.12, 0.14]) * shade[..., None]
-    return _relief("knit", height, albedo, 0.04, 0.7)
+    across, down = (u * wales) % 1 - 0.5, (v * courses) % 1
+    highest, fibre, tangent = (np.zeros((size, size)) for _ in range(3))
+    for side in (-1, 1):
+        lean = np.radians(26) * side
+        for course in (-1, 0, 1):
+            # One leg of a stitch, an ellipsoid: it leans outwards on its way up, and its foot
+            # dips behind the stitch below.
+            x, y = across - 0.25 * side, (down - 0.5 - course) * wales / courses
+            along = x * np.sin(lean) - y * np.cos(lean)
+            over = x * np.cos(lean) + y * np.sin(lean)
+            leg = np.sqrt(np.clip(1 - (along / 0.68) ** 2 - (over / 0.23) ** 2, 0, None))
+            leg = leg * np.clip(0.8 + 0.45 * along, 0, None)
+            wins = leg > highest
+            highest = np.where(wins, leg, highest)
+            fibre = np.where(wins, np.sin(2 * np.pi * (along * 5 + over * side * 6)), fibre)
+            tangent = np.where(wins, np.pi / 2 - lean, tangent)
+    height = depth * (highest + 0.04 * fibre * (highest > 0))
+    shade = 1 + 0.12 * _noise(size, 32, rng) + 0.08 * fibre
+    albedo = (
+        np.array([0.5, 0.11, 0.13]) * (shade * (0.35 + 0.65 * _smooth(highest, 0, 0.4)))[..., None]
+    )
+    return _relief(
+        "knit", height, albedo, 0.04, 0.5, across=np.full((size, size), 0.8), tangent=tangent
+    )
 
 
 def scratched(size: int, depth: float, rng: np.random.Generator) -> Relief:
@@ -167,8 +221,8 @@ def print_(size: int, depth: float, rng: np.random.Generator) -> Relief:
 
 
 def brick(size: int, depth: float, rng: np.random.Generator) -> Relief:
-    """The photograph of a brick wall, with relief read from its brightness."""
-    return _photograph("brick", size, depth, rng, np.array([0.62, 0.32, 0.24]), 0.6)
+    """The photograph of a brick wall, with relief read from its brightness: mortar is low."""
+    return _photograph("brick", size, -depth, rng, np.array([0.62, 0.32, 0.24]), 0.6)
 
 
 def grass(size: int, depth: float, rng: np.random.Generator) -> Relief:
@@ -182,7 +236,7 @@ def gravel(size: int, depth: float, rng: np.random.Generator) -> Relief:
 
 
 # Name -> function and its relief in texels.
-CATALOGUE: dict[str, tuple[Callable[[int, float, np.random.Generator], Relief], float]] = {
+CATALOGUE: dict[str, tuple[Maker, float]] = {
     "cobbles": (cobbles, 8.0),
     "woven": (woven, 1.5),
     "knit": (knit, 3.0),
@@ -198,7 +252,7 @@ CATALOGUE: dict[str, tuple[Callable[[int, float, np.random.Generator], Relief], 
 def _photograph(
     name: str, size: int, depth: float, rng: np.random.Generator, tint: Floats, rough: float
 ) -> Relief:
-    """A grey photograph made periodic, coloured, and given relief: bright is high."""
+    """A grey photograph made periodic, coloured, and given relief: bright is high, if depth > 0."""
     from scipy.ndimage import gaussian_filter
     from skimage import data
     from skimage.transform import resize

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.relief import procedural
+from btfkit.relief.relief import Relief
 from btfkit.relief.trace import traced_btf
 
 # Steeper directions are not measured by any of the rigs whose formats are written.
@@ -59,6 +60,21 @@ def synth_btf(
         samples: rays a texel. bounces: interreflections. seed: of all randomness.
     """
     relief = procedural.make(name, size, relief_texels=relief_texels, seed=seed)
+    return relief_btf(
+        relief, lights=lights, views=views, samples=samples, bounces=bounces, seed=seed
+    )
+
+
+def relief_btf(
+    relief: Relief,
+    *,
+    lights: str = "bonn81",
+    views: str = "bonn81",
+    samples: int = 4,
+    bounces: int = 0,
+    seed: int = 0,
+) -> BTF:
+    """The same of any relief."""
     light_table, view_table = direction_set(lights), direction_set(views)
     light = np.tile(light_table, (len(view_table), 1))
     view = np.repeat(view_table, len(light_table), axis=0)
