@@ -6,20 +6,24 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 
+import cv2
 import mutations
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import sources
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 import btfkit
 from btfkit import io
 from btfkit.btf import BTF
 from btfkit.errors import BtfkitError, FormatError
-from btfkit.io import queryfile
+from btfkit.io import images, queryfile
 from btfkit.materials import file as model_file
 from btfkit.materials.base import Header
 from btfkit.materials.lambert import Lambert, LambertSpec
@@ -252,3 +256,73 @@ def test_damaged_queries_reliefs_and_models_are_told_in_one_line(
         assert len(message) < 1000
 
     law()
+
+
+def _coded(kind: str, folder: Path) -> bytes:
+    """A small picture in one of the codes that its format knows."""
+    codes = (np.random.default_rng(0).random((20, 30, 3)).cumsum(axis=0) * 12).astype(np.uint8)
+    picture, buffer = Image.fromarray(codes), BytesIO()
+    suffix, _, code = kind.partition(" ")
+    match suffix:
+        case "exr":
+            spec = oiio.ImageSpec(30, 20, 3, oiio.HALF)
+            spec.attribute("compression", code.removesuffix(" tiled"))
+            spec.tile_width = spec.tile_height = 8 if code.endswith("tiled") else 0
+            out = oiio.ImageOutput.create(str(folder / "x.exr"))
+            assert out.open(str(folder / "x.exr"), spec)
+            assert out.write_image((codes / 255).astype(np.float16))
+            out.close()
+            return (folder / "x.exr").read_bytes()
+        case "hdr":
+            return cv2.imencode(".hdr", codes.astype(np.float32))[1].tobytes()
+        case "tif" if code == "float":
+            return cv2.imencode(".tif", codes.astype(np.float32))[1].tobytes()
+        case "tif":
+            picture.save(buffer, "tiff", compression=code)
+        case "jpg":
+            picture.convert("CMYK" if code == "cmyk" else "RGB").save(
+                buffer, "jpeg", progressive=code == "progressive"
+            )
+        case _:
+            picture.convert("P" if code == "palette" else "RGB").save(buffer, suffix)
+    return buffer.getvalue()
+
+
+CODED = (
+    "png palette", "jpg progressive", "jpg cmyk", "bmp", "bmp palette", "hdr", "tif tiff_lzw",
+    "tif tiff_adobe_deflate", "tif packbits", "tif float", "exr none", "exr rle", "exr piz tiled",
+    "exr pxr24", "exr b44a", "exr dwaa", "exr zip tiled",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", CODED)
+def test_damaged_pictures_of_every_code_are_refused_or_of_some_size(
+    kind: str, tmp_path: Path
+) -> None:
+    data, name = _coded(kind, tmp_path), f"a.{kind.split()[0]}"
+    assert images.read(name, data, transfer="srgb").shape == (20, 30, 3)
+    refused = 0
+
+    @settings(max_examples=80, **FUZZ)
+    @given(st.lists(mutations.damages(), min_size=1, max_size=3))
+    def law(hurt: list[mutations.Damage]) -> None:
+        nonlocal refused
+        worse = data
+        for each in hurt:
+            worse = each.of(worse)
+        try:
+            pixels = images.read(name, worse, transfer="srgb")
+        except FormatError as error:
+            message = str(error)
+        else:
+            assert pixels.dtype == np.float32
+            assert pixels.ndim == 3
+            return
+        refused += 1
+        assert message.startswith(name)
+        assert "\n" not in message
+        assert len(message) < 1000
+
+    law()
+    assert refused > 10

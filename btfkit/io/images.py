@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import tempfile
 import zlib
@@ -52,10 +53,9 @@ def read(name: str, data: bytes, *, transfer: str) -> Array:
 
 
 def _read_codes(name: str, data: bytes, transfer: str) -> Array:
-    import cv2
-
     check_size(name, *headers.size_of(name, data), coded=len(data))
     _check_whole(name, data)
+    cv2 = _opencv()
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
     try:
         codes = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -75,6 +75,15 @@ def _read_codes(name: str, data: bytes, transfer: str) -> Array:
     if codes.dtype == np.float32:
         return np.ascontiguousarray(codes)
     raise FormatError(name, f"pixels are {codes.dtype}; expected 8 or 16 bit, or float32")
+
+
+@functools.cache
+def _opencv() -> Any:
+    """OpenCV, which writes no errors of its own beside ours."""
+    import cv2
+
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    return cv2
 
 
 def _looked_up(codes: NDArray[np.uint16], table: Array) -> Array:

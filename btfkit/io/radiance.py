@@ -91,9 +91,10 @@ def _scanlines(name: str, data: bytes, at: int, count: int, length: int) -> NDAr
         return np.frombuffer(data, np.uint8, flat, at).reshape(count, length, 4)
     if len(data) - at < 4 * count:
         raise FormatError(name, f"cut short: {len(data) - at} bytes for {count} scanlines")
+    start = b"\x02\x02" + length.to_bytes(2, "big")
     out = np.empty((count, 4, length), np.uint8)
     for line in range(count):
-        if data[at : at + 2] != b"\x02\x02" or data[at + 2] << 8 | data[at + 3] != length:
+        if data[at : at + 4] != start:
             raise FormatError(name, f"scanline {line} does not start with its length {length}")
         at += 4
         for channel in range(4):
