@@ -539,6 +539,36 @@ def test_holes_are_holes_on_the_dark_side_too() -> None:
     np.testing.assert_array_equal(dark.radiance, 0)
 
 
+def test_what_passes_a_model_with_curvature_does_not_meet_the_shape_from_inside() -> None:
+    seen = pictured(Bent(white(), 0.5), "sphere", size=(33, 33))
+    assert seen.cover[16, 16] == pytest.approx(0.5, abs=1e-6)
+    assert seen.radiance[16, 16, 0] == pytest.approx(0.5, abs=1e-6)
+
+
+def test_a_relief_under_a_sphere_is_the_smaller_sphere() -> None:
+    from btfkit.relief.relief import Relief
+    from btfkit.render.traced import TracedRelief, TracedSpec
+
+    size, repeat, depth = (8, 8), 2, 0.05
+    maps = {"albedo": white(8), "specular": 0 * white(8), "roughness": np.ones(size, np.float32)}
+    relief = Relief(height=np.full(size, -depth, np.float32), **maps)
+    shape, light = shape_of("sphere", repeat=repeat), towards(50, 30)
+    material = TracedRelief(relief, TracedSpec(samples=1))
+    seen = pictured(material, shape, light, size=(64, 64))
+    # The radius is repeat / pi tiles.
+    radius = 1 - depth * np.pi / repeat
+    x = (np.arange(64) + 0.5 - 32) * shape.half_height / 32
+    square = (x**2 + x[:, None] ** 2) / radius**2
+    z = np.sqrt(np.maximum(1 - square, 0))
+    normal = np.stack(np.broadcast_arrays(x / radius, -x[:, None] / radius, z), axis=-1)
+    inside = np.abs(square - 1) > 0.02
+    np.testing.assert_array_equal((seen.cover > 0.5)[inside], (square < 1)[inside])
+    # The tracer bends tiles along the view ray only, which for a sphere is exact; float32.
+    deep = square < 0.9
+    expected = np.maximum(normal @ light, 0)
+    np.testing.assert_allclose(seen.radiance[deep][:, 0], expected[deep], atol=2e-3)
+
+
 def test_answers_that_are_not_finite_are_black_and_counted() -> None:
     image, opacity = white(4), np.full((4, 4), 0.5)
     image[0, 0], opacity[3, 3] = np.nan, np.nan
@@ -673,6 +703,7 @@ def test_polygons_negative_indices_and_continued_lines_are_read(tmp_path: Path) 
     ("v 0 0\n", r"line 1: v has 2 numbers; expected 3"),
     ("v 0 0 x\n", r"line 1: could not convert"),
     (TRIANGLE.replace("v 1", "v nan") + "f 1/1 2/2 3/3\n", "v holds values that are not finite"),
+    (TRIANGLE.replace("v 1", "v 1e99") + "f 1/1 2/2 3/3\n", "v holds .* beyond 1e30"),
     (TRIANGLE + "f 1/1 1/2 1/3\n", "no triangle has an area"),
 ])  # fmt: skip
 def test_a_damaged_obj_is_refused_in_words(text: str, message: str, tmp_path: Path) -> None:

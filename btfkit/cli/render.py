@@ -83,7 +83,7 @@ def render_verb(
     final = out or Path(stem(source) + ".png")
     picture.check_name(final)
     refuse_existing(final, force=force)
-    material = _material(source)
+    material = _material(source, curved=shape != "plane")
     if env is not None or shape != "plane":
         # Such a picture needs most of the textures anyway.
         material = _at_hand(material)
@@ -141,15 +141,16 @@ def _directions(option: str, angles: tuple[tuple[float, float], ...]) -> Floats:
     return from_angles(*np.radians(degrees).T)
 
 
-def _material(source: Path) -> Material:
-    """A model's or a BTF's material, or a relief that is traced."""
+def _material(source: Path, *, curved: bool) -> Material:
+    """A model's or a BTF's material, or a traced relief, of which nothing juts out of a shape."""
     import btfkit
 
     if source.suffix.lower() == ".exr":
         from btfkit.relief.file import read
         from btfkit.render.traced import TracedRelief
 
-        return TracedRelief(read(source))
+        relief = read(source)
+        return TracedRelief(relief.under_surface()[0] if curved else relief)
     if source.suffix == ".safetensors":
         return btfkit.load(source)
     from btfkit.materials.interpolation import Interpolation

@@ -9,6 +9,7 @@ they should be convex.
 from __future__ import annotations
 
 import itertools
+from array import array
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +21,7 @@ from btfkit.errors import FormatError
 
 Floats = NDArray[np.floating]
 _COUNTS = {"v": 3, "vt": 2, "vn": 3}
-_MOST_BYTES, _MOST_TRIANGLES = 1 << 30, 1 << 22
+_MOST_BYTES, _MOST_TRIANGLES, _MOST_VALUE = 1 << 30, 1 << 22, 1e30
 
 
 class Triangles(NamedTuple):
@@ -46,23 +47,25 @@ def read(path: Path) -> Triangles:
     size = path.stat().st_size
     if size > _MOST_BYTES:
         raise FormatError(path, f"{size} bytes; at most {_MOST_BYTES} are read")
-    tables: dict[str, list[list[float]]] = {name: [] for name in _COUNTS}
-    faces: list[tuple[int, int, int]] = []
+    # Plain arrays of numbers: lists of lists would take ten times their memory.
+    tables = {name: array("d") for name in _COUNTS}
+    faces = array("q")
     with path.open(encoding="utf-8", errors="replace") as file:
         for number, line in _joined(file):
             words = line.split("#", 1)[0].split()
             try:
                 if words and words[0] in tables:
-                    tables[words[0]].append(_numbers(words))
+                    tables[words[0]].extend(_numbers(words))
                 elif words and words[0] == "f":
-                    faces += _fan(words[1:], {name: len(t) for name, t in tables.items()})
+                    known = {name: len(tables[name]) // count for name, count in _COUNTS.items()}
+                    faces.extend(_fan(words[1:], known))
             except ValueError as error:
                 raise FormatError(path, f"line {number}: {error}") from error
-            if len(faces) > 3 * _MOST_TRIANGLES:
+            if len(faces) > 9 * _MOST_TRIANGLES:
                 raise FormatError(path, f"more than {_MOST_TRIANGLES} triangles")
     if not faces:
         raise FormatError(path, "no faces (lines that begin with f)")
-    return _triangles(path, tables, np.array(faces).reshape(-1, 3, 3))
+    return _triangles(path, tables, np.array(faces, np.intp).reshape(-1, 3, 3))
 
 
 def _joined(file: Iterable[str]) -> Iterator[tuple[int, str]]:
@@ -85,12 +88,13 @@ def _numbers(words: list[str]) -> list[float]:
     return numbers
 
 
-def _fan(words: list[str], known: dict[str, int]) -> list[tuple[int, int, int]]:
-    """Corners (v, vt, vn) of the triangles of one polygon; -1 where it has no such index."""
+def _fan(words: list[str], known: dict[str, int]) -> list[int]:
+    """v, vt, vn of each corner of each triangle of one polygon; -1 where there is no such index."""
     if len(words) < 3:
         raise ValueError(f"a face of {len(words)} corners; expected 3 or more")
     corners = [_corner(word, known) for word in words]
-    return [corner for pair in itertools.pairwise(corners[1:]) for corner in (corners[0], *pair)]
+    triangles = ((corners[0], *pair) for pair in itertools.pairwise(corners[1:]))
+    return [index for triangle in triangles for corner in triangle for index in corner]
 
 
 def _corner(word: str, known: dict[str, int]) -> tuple[int, int, int]:
@@ -104,9 +108,7 @@ def _corner(word: str, known: dict[str, int]) -> tuple[int, int, int]:
     return v, vt, vn
 
 
-def _triangles(
-    path: Path, tables: dict[str, list[list[float]]], faces: NDArray[np.intp]
-) -> Triangles:
+def _triangles(path: Path, tables: dict[str, array[float]], faces: NDArray[np.intp]) -> Triangles:
     if (faces[..., 1] < 0).any():
         missing = int((faces[..., 1] < 0).any(axis=1).sum())
         raise FormatError(
@@ -121,8 +123,8 @@ def _triangles(
         if last >= len(table):
             raise FormatError(path, f"a face names {name} {last + 1}; there are {len(table)}")
         used = table[np.unique(faces[..., column][faces[..., column] >= 0])]
-        if not np.isfinite(used).all():
-            raise FormatError(path, f"{name} holds values that are not finite")
+        if not (np.abs(used) < _MOST_VALUE).all():
+            raise FormatError(path, f"{name} holds values that are not finite or beyond 1e30")
         # Without normals every index is -1, and what it picks is replaced below.
         values[name] = (table if len(table) else np.zeros((1, count)))[faces[..., column]]
     corner, normal = values["v"], values["vn"]

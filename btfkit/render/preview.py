@@ -165,6 +165,8 @@ class _Painter:
                 np.broadcast_to(toward, (len(alive), 3)), self._pixel,
             )  # fmt: skip
             light, opacity = self._lit(surface, seen, numbers[alive])
+            if self._shadows.body:
+                opacity = np.where(seen.outside, opacity, 0.0)
             radiance[alive] += (through[alive] * opacity)[:, None] * light
             through[alive] *= 1 - opacity
             beyond[alive] = met.distance + NEAR

@@ -32,12 +32,15 @@ class Shadows:
 
     Attributes:
         holes: whether the material may be seen through.
+        body: whether it fills the shape up to its surface, as models with curvature do: what
+            passes it leaves the shape without meeting it from inside.
         asked: queries that the material answered.
     """
 
     def __init__(self, material: Material, shape: Shape, pixel: Floats) -> None:
         self._material, self._shape, self._pixel = material, shape, pixel
         self.holes = material.has_curvature or _has_holes(material)
+        self.body = material.has_curvature and not isinstance(shape, Plane)
         self.asked = 0
 
     def reached(
@@ -105,7 +108,8 @@ class Shadows:
         opacity = self._material.evaluate(
             seen.uv, _ABOVE, seen.view, seen.footprint, seen.curvature
         ).opacity
-        return np.where(np.isfinite(opacity), opacity, 1.0)
+        opacity = np.where(np.isfinite(opacity), opacity, 1.0)
+        return np.where(seen.outside, opacity, 0.0) if self.body else opacity
 
 
 def _has_holes(material: Material) -> bool:

@@ -27,11 +27,16 @@ class TracedSpec:
 
 @final
 class TracedRelief(Material):
-    """A relief on the plane; footprints are those of its own texels."""
+    """A relief on the plane, or under a curved surface where no height should be above 0.
+
+    Footprints count its own texels. On a curved surface rays pass what the relief does not fill.
+    """
 
     model: ClassVar[str] = "relief"
     spec_type: ClassVar[type] = TracedSpec
     has_levels: ClassVar[bool] = True
+    has_curvature: ClassVar[bool] = True
+    full_sphere: ClassVar[bool] = True
 
     def __init__(self, relief: Relief, spec: TracedSpec | None = None) -> None:
         header = Header(
@@ -42,7 +47,7 @@ class TracedRelief(Material):
             provenance=dict(relief.provenance),
         )
         super().__init__(spec or TracedSpec(), {}, header)
-        self._geometry, self._has_holes = geometry(relief), relief.opacity is not None
+        self._geometry = geometry(relief)
 
     @classmethod
     def shapes(cls, spec: TracedSpec, header: Header) -> dict[str, tuple[int, ...]]:
@@ -53,4 +58,4 @@ class TracedRelief(Material):
         traced = trace(
             self._geometry, query, samples=spec.samples, bounces=spec.bounces, seed=spec.seed
         )
-        return traced.rgb, traced.opacity if self._has_holes else None
+        return traced.rgb, traced.opacity
