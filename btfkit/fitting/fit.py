@@ -112,8 +112,8 @@ def fit(
     """
     final = None if out is None else refuse_existing(out, force=force)
     source = _traced(source)
-    chosen, choice = _chosen(source, model)
-    given = dict(settings or {})
+    chosen, choice, parts = _chosen(source, model)
+    given = {**parts, **(settings or {})}
     train, test = split(len(source), holdout, seed)
     start, cpu = time.perf_counter(), time.process_time()
     if chosen in CLOSED_FORM:
@@ -231,14 +231,15 @@ def _traced(source: BTF | QuerySet | Relief) -> BTF | QuerySet:
     return traced_btf(source, light, view)
 
 
-def _chosen(source: BTF | QuerySet, model: str) -> tuple[str, tuple[str, ...]]:
+def _chosen(source: BTF | QuerySet, model: str) -> tuple[str, tuple[str, ...], Mapping[str, str]]:
     if model != "auto":
         if model not in MODELS:
             raise ValueError(f"no model {model!r}; there are auto, {', '.join(MODELS)}")
-        return model, ()
+        return model, (), {}
     from btfkit.fitting.choice import choose
 
-    return choose(source)
+    choice = choose(source)
+    return choice.model, choice.reasons, choice.settings
 
 
 def _samples(source: BTF | QuerySet) -> int:
