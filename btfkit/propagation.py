@@ -24,7 +24,7 @@ from btfkit.btf import Wrap
 from btfkit.errors import FitError, FormatError
 from btfkit.files import refuse_existing
 from btfkit.fitting import augment
-from btfkit.fitting.neubtf import encode
+from btfkit.fitting.guides import encode
 from btfkit.fitting.unet import Encoder
 from btfkit.io import images
 from btfkit.materials import file
@@ -52,8 +52,8 @@ def propagate(
         guidance: an image file, or (h, w, c) linear values in 0..1; grey is repeated, alpha
             left out with a warning.
         model: a NeuBTF file with its encoder.
-        scale: the guidance is resized by this first; within the scales of the training (half to
-            one, unless it was set otherwise) the material scales with it.
+        scale: the guidance is resized by this first; within the scales of the training (a quarter
+            to one, unless it was set otherwise) the material scales with it.
         tileable: make the guidance tile first.
         wrap: whether the guidance tiles; None takes "wrap" where it was made to, else "clamp".
         out: file to write, without the encoder; None writes nothing.

@@ -5,6 +5,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+# Before anything counts processors: parallel workers that each took them all would wait for
+# each other at every step.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    for name in ("BTFKIT_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
 import hypothesis
 import pytest
 
