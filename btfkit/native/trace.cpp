@@ -261,8 +261,9 @@ inline Look look(const Relief& r, const Queries& in, size_t q, int i, int sample
 }
 
 // The maps are far larger than the near caches, and where a ray ends is known late: ask for them as
-// soon as it is, and use them after other rays have been followed.
-inline void fetch(const Relief& r, const Hit& hit) {
+// soon as it is, and use them after other rays have been followed. (Always inline: GCC takes a
+// function that does nothing else for one without effect, and drops the call.)
+[[gnu::always_inline]] inline void fetch(const Relief& r, const Hit& hit) {
   if (!hit.found) return;
   for (int down = 0; down < 2; ++down) {
     int i = wrapped(hit.at.i, r.w, r.wrap), j = wrapped(hit.at.j + down, r.h, r.wrap);
