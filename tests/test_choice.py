@@ -49,13 +49,13 @@ def test_the_size_of_the_data_decides(pairs: slice, size: int, model: str, reaso
     assert reason in choice.reasons[0]
 
 
-def test_one_view_under_many_lights_is_factorised() -> None:
+def test_under_one_view_nothing_moves() -> None:
     light = direction_set("40")
     view = np.tile([[0.0, 0.0, 1.0]], (40, 1))
     choice = choose(BTF(np.ones((40, 4, 4, 3), np.float32), light, view))
-    assert choice.model == "pca"
-    assert choice.settings == {"rank": "10"}
-    assert "there is one view" in choice.reasons[0]
+    assert choice.model == "neumip"
+    assert choice.settings == {"levels": "1", "offset": "0"}
+    assert "no offset stage: there is one view, nothing moves" in choice.reasons
 
 
 def test_a_flat_material_gets_no_offset_stage_and_a_deep_one_does() -> None:

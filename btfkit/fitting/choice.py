@@ -77,13 +77,13 @@ def _for_btf(btf: BTF) -> Choice:
     if n < _SPARSE:
         why = f"interpolation: {n} pairs are too few to learn from, and few enough to keep"
         return Choice("interpolation", (why,))
-    if len(views) == 1:
-        rank = max(1, min(16, n // 4))
-        why = f"pca: there is one view, and {n} lights of {h} x {w} texels factorise at once"
-        return Choice("pca", (why,), {"rank": str(rank)})
     reasons = [f"neumip: {len(lights)} lights and {len(views)} views of {h} x {w} texels"]
     settings = {"levels": "1"}
     reasons.append("one level of detail: a BTF has no footprints; levels=N adds N - 1 coarser ones")
+    if len(views) == 1:
+        settings["offset"] = "0"
+        reasons.append("no offset stage: there is one view, nothing moves")
+        return Choice("neumip", tuple(reasons), settings)
     moved = moving(btf)
     if moved is not None and moved < _FLAT_TEXELS:
         settings["offset"] = "0"
