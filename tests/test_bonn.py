@@ -307,6 +307,8 @@ def test_fault_corrupt_counts_are_allocated_before_they_are_checked(opened) -> N
     data = bytearray(files.fmf(made, *files.random_factors(made, 3)))
     head = len(made.head(b"!FMF12FCER"))
     places = {
+        "channels": 10 + 268 + 4,
+        "XML": 10 + 268,
         "views": 10 + len(made.meta()),
         "lights": 10 + len(made.meta()) + 12,
         "width": head - 12,

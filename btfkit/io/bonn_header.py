@@ -19,6 +19,7 @@ SCALARS = {2: "<f2", 4: "<f4", 8: "<f8"}
 # In the place of the meta block of old files of one factorisation a view.
 LEGACY = 301074
 _VERSIONS = range(1, 5)
+_MOST_CHANNELS = 1 << 16
 _COPY = "download or copy the file again"
 # Rounding of pi / 2 in float32, and tables that were made in degrees.
 _BELOW_HORIZON = 1e-3
@@ -163,8 +164,10 @@ def _cosine(cursor: Cursor) -> bool:
 def _channels(cursor: Cursor) -> tuple[str, ...]:
     count = cursor.u32("number of channels")
     # Each name has at least its length.
-    if not 1 <= count <= cursor.left // 4:
-        raise cursor.error(f"{count} channels with {cursor.left} bytes left")
+    if not 1 <= count <= min(_MOST_CHANNELS, cursor.left // 4):
+        raise cursor.error(
+            f"{count} channels with {cursor.left} bytes left; expected 1 to {_MOST_CHANNELS}"
+        )
     lengths = (cursor.u32("length of a channel name") for _ in range(count))
     return tuple(cursor.text(length, "channel name") for length in lengths)
 
