@@ -18,6 +18,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "query": ("btfkit.cli.query", "Answer a query file with a model."),
     "render": ("btfkit.cli.render", "A picture of a material on a simple shape."),
     "synth": ("btfkit.cli.synth", "Make a procedural material with known relief."),
+    "bench": ("btfkit.cli.bench", "Time against error of all models on this machine."),
     "info": ("btfkit.cli.info", "What a file is; without a path: versions and kernels."),
 }
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, final
 
@@ -28,7 +28,6 @@ from btfkit.materials.base import Header, Material
 from btfkit.materials.neumip import NeuMIPSpec, aligned, most_levels
 from btfkit.native.neumip import Array, Kernel, Layout, Network, available
 from btfkit.queries import QuerySet
-
 
 # Direction pairs for which a decay of 1 is right; docs/neumip.md has the measurements.
 _DECAY_PAIRS = 60
@@ -308,6 +307,11 @@ class NeuMIP(_Trainable):
             batch.target, batch.weight, loss=self.settings.loss,  # type: ignore[arg-type]
         )  # fmt: skip
         return loss
+
+    def bare_gradient(self, count: int) -> Callable[[], object]:
+        """A call that takes the gradient of one and the same batch again: the kernel alone."""
+        batch = self._source.batch(0, count)
+        return lambda: self._kernel_gradient(batch)
 
     def _torch_gradient(self, batch: Batch) -> float:
         weights, texels = (torch.from_numpy(a).requires_grad_() for a in self._current())

@@ -524,7 +524,7 @@ def variants() -> list[str]:
 
 
 def peak(seconds: float = 0.2, variant: str = "") -> float:
-    """Measured float32 operations a second of one thread: multiply-adds from registers."""
+    """Measured float32 operations a CPU second of one thread: multiply-adds from registers."""
     module = native.load("neumip")
     if module is None:
         raise RuntimeError("the NeuMIP kernel was not built")

@@ -1,0 +1,222 @@
+"""NeuMIP's kernels against the processor: rates of one thread as a share of its measured peak."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from btfkit.bench.cells import peak
+from btfkit.btf import BTF
+from btfkit.fitting.neumip import NeuMIP, initial_texels, initial_weights
+from btfkit.materials import neumip as evaluated
+from btfkit.materials.base import Header
+from btfkit.materials.neumip import NeuMIPSpec, most_levels
+from btfkit.native.neumip import Activation, Array, Kernel, Layout, variants
+from btfkit.textures import as_textures
+
+_SECONDS = 0.5
+Asked = tuple[Array, Array, Array, Array | None]
+
+
+def kernel_table(seconds: float = _SECONDS) -> list[dict[str, Any]]:
+    """Rates of evaluation and of forward + backward, by size, activation and vector variant.
+
+    Network operations alone count: 2 a weight to evaluate, 6 to train; lookups come on top.
+    """
+    chosen: list[tuple[int, Activation, str]] = [
+        (size, activation, variants()[0])
+        for activation in ("relu", "sine")
+        for size in (128, 512)
+    ]  # fmt: skip
+    chosen += [(128, "relu", name) for name in variants()[1:]]
+    return [_one_kernel(*choice, seconds) for choice in chosen]
+
+
+def _one_kernel(size: int, activation: Activation, variant: str, seconds: float) -> dict[str, Any]:
+    layout, weights, texels = _published(size, activation, levels=size > 128)
+    kernel = Kernel(layout, threads=1, variant=variant)
+    ask = _asked(1 << 16, layout, mixed=size > 128)
+    target = np.random.default_rng(1).random((len(ask[0]), 3), np.float32)
+    work = 2 * (layout.weights - _biases(layout))
+    evaluate = _rate(lambda: kernel.evaluate(weights, texels, *ask), len(ask[0]), seconds)
+    train = _rate(lambda: kernel.train(weights, texels, *ask, target), len(ask[0]), seconds)
+    return {
+        "size": size,
+        "levels": "mixed" if size > 128 else "0",
+        "activation": activation,
+        "variant": variant,
+        "evaluate_per_s": evaluate,
+        "train_per_s": train,
+        "evaluate_share": work * evaluate / peak(),
+        "train_share": 3 * work * train / peak(),
+    }
+
+
+def loop_table(seconds: float = _SECONDS) -> list[dict[str, Any]]:
+    """Rate of whole training steps beside that of the bare kernel on one and the same batch."""
+    from btfkit.fitting.loop import Generators
+
+    rows = []
+    for size, batch in ((128, 1 << 13), (512, 1 << 16)):
+        settings = {"batch": str(batch), "activation": "relu", "inputs": "xy"}
+        trainable = NeuMIP(
+            _noise(12, size), np.arange(12), np.arange(0),
+            settings=settings, generators=Generators(0),
+        )  # fmt: skip
+        whole = _rate(partial(trainable.step, 0.3), batch, seconds)
+        bare = _rate(trainable.bare_gradient(batch), batch, seconds)
+        rows.append(
+            {
+                "size": size,
+                "batch": batch,
+                "loop_per_cpu_s": whole,
+                "kernel_per_cpu_s": bare,
+                "share": whole / bare,
+            }
+        )
+    return rows
+
+
+def skip_table(seconds: float = _SECONDS, *, size: int = 512) -> list[dict[str, Any]]:
+    """What is saved where a part is not needed: nanoseconds a query of one thread."""
+    layout, weights, texels = _published(size, "relu", levels=True)
+    mixed, sharp = (_asked(1 << 16, layout, mixed=mixed) for mixed in (True, False))
+    count = len(mixed[0])
+    flat, flat_weights, flat_texels = _published(size, "relu", levels=True, offset=False)
+    kernel, bare = Kernel(layout, threads=1), Kernel(flat, threads=1)
+    at_zero = np.full(count, 0.5, np.float32)
+    lights = sharp[1][:16].copy()
+    uv, _, view, _ = (None if a is None else a[: count // 16].copy() for a in sharp)
+    assert uv is not None
+    assert view is not None
+    timed: dict[str, Callable[[], object]] = {
+        "everything, mixed levels": lambda: kernel.evaluate(weights, texels, *mixed),
+        "no offset stage": lambda: bare.evaluate(flat_weights, flat_texels, *mixed),
+        "level 0, footprints given": lambda: kernel.evaluate(weights, texels, *sharp[:3], at_zero),
+        "level 0, no footprints": lambda: kernel.evaluate(weights, texels, *sharp),
+        "16 lights a view, view stage kept": lambda: kernel.evaluate_lights(
+            weights, texels, uv, lights, view
+        ),
+    }
+    taken = {name: 1e9 / _rate(call, count, seconds) for name, call in timed.items()}
+    everything = taken["everything, mixed levels"]
+    return [
+        {"skip": name, "ns": ns, "of_everything": ns / everything} for name, ns in taken.items()
+    ]
+
+
+def region_table(seconds: float = _SECONDS) -> list[dict[str, Any]]:
+    """Reading a quarter of each texture of a store, beside reading all of it."""
+    from btfkit import io
+    from btfkit.io import store_write
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "noise.btf.zarr"
+        store_write.write(_noise(16, 512), path)
+        btf = io.open(path)
+        quarter = btf.crop(slice(0, 256), slice(0, 256))
+        whole, part = (_rate(partial(_read_all, source), 16, seconds) for source in (btf, quarter))
+    return [
+        {"read": "whole textures", "ms": 1e3 / whole, "of_everything": 1.0},
+        {"read": "a quarter of each", "ms": 1e3 / part, "of_everything": whole / part},
+    ]
+
+
+def _read_all(btf: BTF) -> None:
+    for index in range(len(btf)):
+        btf.texture(index)
+
+
+def precision_table(material: evaluated.NeuMIP, asked: Asked) -> list[dict[str, Any]]:
+    """What smaller textures of a fitted model change in its answers."""
+    blur = 0.5 if asked[3] is None else asked[3]
+    first = evaluated.in_precision(material, "float32")
+    truth = first.evaluate(*asked[:3], blur).reflectance
+    rows = []
+    precisions: tuple[Literal["float32", "float16", "int8"], ...] = ("float32", "float16", "int8")
+    for precision in precisions:
+        stored = evaluated.in_precision(first, precision)
+        error = stored.evaluate(*asked[:3], blur).reflectance - truth
+        mse = float(np.square(error).mean())
+        rows.append(
+            {
+                "precision": precision,
+                "bytes": int(sum(a.nbytes for a in stored.weights.values())),
+                "mae": float(np.abs(error).mean()),
+                "psnr": -10 * float(np.log10(max(mse, 1e-20))),
+            }
+        )
+    return rows
+
+
+def _published(
+    size: int, activation: Activation, *, levels: bool, offset: bool = True
+) -> tuple[Layout, Array, Array]:
+    count = most_levels((size, size)) if levels else 1
+    spec = NeuMIPSpec(
+        (size, size), count, activation=activation, offset_activation=activation, output="relu"
+    )
+    if not offset:
+        spec = replace(spec, offset=0)
+    layout = spec.layout(Header(grid=(size, size)))
+    rng = np.random.default_rng(0)
+    weights = np.zeros(layout.weights, np.float32)
+    first, second = layout.split(weights)
+    if layout.offset is not None:
+        initial_weights(layout.offset[1], first, rng, 1.0)
+    initial_weights(layout.decoder, second, rng, 1.0)
+    texels = initial_texels(layout, rng)
+    # A depth of 0 everywhere would be kinder to the caches than a relief is.
+    if offset:
+        texels[: size * size, :7] = 0.3 * rng.standard_normal((size * size, 7))
+    return layout, weights, texels
+
+
+def _biases(layout: Layout) -> int:
+    networks = [layout.decoder] + ([layout.offset[1]] if layout.offset else [])
+    return sum(sum(network.widths[1:]) for network in networks)
+
+
+def _asked(count: int, layout: Layout, *, mixed: bool) -> Asked:
+    """Queries at random; `mixed`: half at level 0, half anywhere in the pyramid."""
+    rng = np.random.default_rng(4)
+    uv = rng.random((count, 2), np.float32)
+    light, view = (_upper(rng, count) for _ in range(2))
+    if not mixed:
+        return uv, light, view, None
+    top = len(layout.banks[0].sizes) - 1
+    level = np.where(rng.random(count) < 0.5, 0, rng.uniform(0, top, count))
+    return uv, light, view, (0.5 * 2**level).astype(np.float32)
+
+
+def _upper(rng: np.random.Generator, count: int) -> Array:
+    radius, angle = np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
+    flat = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    return np.column_stack([flat, np.sqrt(np.maximum(1 - radius**2, 0))]).astype(np.float32)
+
+
+def _noise(pairs: int, size: int) -> BTF:
+    rng = np.random.default_rng(5)
+    values = rng.random((pairs, size, size, 3), np.float32).astype(np.float16)
+    return BTF(as_textures(values), _upper(rng, pairs), _upper(rng, pairs), wrap="wrap")
+
+
+def _rate(call: Callable[[], object], count: int, seconds: float) -> float:
+    """`count` a CPU second: the best of as many calls as fit, at least five, after a first one.
+
+    The best, as for the peak that it is compared with: neighbours on the machine only slow down.
+    """
+    call()
+    taken: list[float] = []
+    while sum(taken) < seconds or len(taken) < 5:
+        start = time.process_time()
+        call()
+        taken.append(time.process_time() - start)
+    return count / min(taken)

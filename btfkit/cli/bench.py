@@ -1,0 +1,74 @@
+"""`btfkit bench`: time against error of models on materials, on this machine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import click
+
+from btfkit.cli.bar import Bar
+from btfkit.cli.options import DurationType, out_option, seed_option
+from btfkit.cli.outcome import Outcome, verb
+
+
+@verb("bench", example="btfkit bench cobbles wool.btf.zarr --model neumip --model pca --quick")
+@click.argument("names", nargs=-1)
+@out_option("Folder of results, resumed where it exists; by default bench")
+@click.option("--model", "models", multiple=True, help="Only these models; repeatable.")
+@click.option(
+    "--budget", "budgets", type=DurationType(), multiple=True,
+    help="CPU time of training, over all threads; repeatable.",
+)  # fmt: skip
+@click.option("--size", type=click.IntRange(8, 4096), help="Texels a side of traced materials.")
+@click.option("--directions", type=click.IntRange(2, 151), help="Lights, and views, of these.")
+@click.option("--quick", is_flag=True, help="Small materials and budgets: under two minutes.")
+@seed_option
+def bench_verb(
+    bar: Bar,
+    *,
+    names: tuple[str, ...],
+    out: Path | None,
+    models: tuple[str, ...],
+    budgets: tuple[float, ...],
+    size: int | None,
+    directions: int | None,
+    quick: bool,
+    seed: int,
+) -> Outcome:
+    """Fit models to materials within budgets, and write what each cost and how far off it is.
+
+    NAMES: materials of `btfkit synth --list`, or stores and whatever else `ingest` reads. Writes
+    bench.json, bench.md and two plots. What a former run of the same folder finished is kept.
+    """
+    from btfkit.bench.run import QUICK, Profile, run
+    from btfkit.bench.tables import generic
+    from btfkit.relief.procedural import CATALOGUE
+
+    profile = QUICK if quick else Profile()
+    if names:
+        stores = tuple(Path(name) for name in names if name not in CATALOGUE)
+        for path in stores:
+            if not path.exists():
+                raise ValueError(
+                    f"{path} is neither a file nor a material; there are {', '.join(CATALOGUE)}"
+                )
+        profile = replace(
+            profile, stores=stores, materials=tuple(name for name in names if name in CATALOGUE)
+        )
+    profile = replace(
+        profile,
+        models=models or profile.models,
+        budgets_cpu_s=tuple(sorted(budgets)) or profile.budgets_cpu_s,
+        size=size or profile.size,
+        directions=directions or profile.directions,
+        seed=seed,
+    )
+    folder = out or Path("bench")
+    found = run(profile, folder, progress=bar)
+    files = [folder / name for name in FILES]
+    line = f"{folder}: {len(found['cells'])} cells\n\n{generic(found['targets'])}"
+    return Outcome(line, {**found, "files": files})
+
+
+FILES = ("bench.json", "bench.md", "rate-distortion.png", "time-to-error.png")

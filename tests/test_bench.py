@@ -1,0 +1,167 @@
+"""The benchmark: what it measures, keeps and takes up again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from btfkit.bench import cells, kernels, run, tables
+from btfkit.bench.cases import procedural, stored
+from btfkit.cli import btfkit
+from btfkit.cli.outcome import run as run_cli
+from btfkit.errors import BtfkitError
+from btfkit.io import store_write
+from btfkit.native import neumip as native
+
+compiled = pytest.mark.skipif(not native.available(), reason="the kernel was not built")
+TINY = run.Profile(
+    materials=("print",), models=("lambert", "neumip"), budgets_cpu_s=(0.05, 0.1), size=16,
+    directions=3, kernel_seconds=0,
+)  # fmt: skip
+CONTRACT = ("mse", "psnr", "mse_log1p", "psnr_log1p", "mae", "psnr_srgb", "ssim_srgb", "flip")
+
+
+def test_cases_hold_out_pictures_and_every_level():
+    case = procedural("print", size=16, directions=3, seed=0)
+    assert len(case.train) == 9
+    assert len(case.pictures) == 12
+    levels = np.unique(np.log2(2 * case.queries.footprint))
+    np.testing.assert_array_equal(levels, np.arange(5))
+    trained = {tuple(row) for row in np.hstack([case.train.light, case.train.view])}
+    held = np.hstack([case.pictures.light, case.pictures.view])
+    assert not trained & {tuple(row) for row in held}
+    # The coarsest level is next to the mean of each picture.
+    coarse = case.queries.footprint == 8
+    for pair in range(12):
+        same = coarse & (case.queries.light == case.pictures.light[pair]).all(axis=1)
+        mean = case.pictures.texture(pair).mean(axis=(0, 1))
+        np.testing.assert_allclose(case.queries.rgb[same].mean(axis=0), mean, rtol=0.1, atol=0.01)
+
+
+def test_stores_hold_out_what_fit_holds_out(tmp_path):
+    case = procedural("print", size=16, directions=5, seed=0)
+    store_write.write(case.train, tmp_path / "p.btf.zarr")
+    found = stored(tmp_path / "p.btf.zarr", holdout=0.2, seed=3)
+    assert found.name == "p"
+    assert (len(found.train), len(found.pictures)) == (20, 5)
+
+
+def test_a_run_reports_the_contracts_errors_and_is_taken_up_again(tmp_path, monkeypatch):
+    found = run.run(TINY, tmp_path / "out")
+    labels = [(row["label"], row["budget_cpu_s"]) for row in found["cells"]]
+    assert labels[:3] == [("lambert", None), ("neumip", 0.05), ("neumip", 0.1)]
+    assert ("neumip offset=0", 0.1) in labels
+    for row in found["cells"]:
+        assert all(np.isfinite(row[key]) for key in CONTRACT)
+        assert row["bytes"] > 0
+        assert row["queries_per_s"] > 0
+    ours = found["cells"][2]
+    assert 0.1 <= ours["cpu_seconds"] < 5
+    assert ours["parameters"] == 3429
+    assert [level["level"] for level in ours["levels"]] == [0, 1, 2, 3, 4]
+    assert ours["curve"][-1]["cpu_s"] == pytest.approx(ours["cpu_seconds"])
+    for name in ("bench.json", "bench.md", "rate-distortion.png", "time-to-error.png"):
+        assert (tmp_path / "out" / name).stat().st_size > 500
+    assert json.loads((tmp_path / "out" / "bench.json").read_text())["cells"] == found["cells"]
+
+    def refuse(*_):
+        raise AssertionError("a finished cell was run again")
+
+    monkeypatch.setattr(run, "run_cell", refuse)
+    seen = []
+    again = run.run(TINY, tmp_path / "out", progress=lambda done, of: seen.append(done / of))
+    assert again["cells"] == found["cells"]
+    assert seen[-1] == 1
+    with pytest.raises(BtfkitError, match="name another folder"):
+        run.run(replace(TINY, size=24), tmp_path / "out")
+
+
+def test_a_model_that_refuses_a_material_is_reported_not_raised(tmp_path, monkeypatch):
+    def refuse(cell, case):
+        raise BtfkitError(f"{cell.model} wants more than {len(case.train)} pairs")
+
+    monkeypatch.setattr(run, "run_cell", refuse)
+    found = run.run(replace(TINY, models=("lambert",)), tmp_path / "out")
+    assert found["cells"][0]["failed"] == "lambert wants more than 9 pairs"
+    assert "wants more than 9 pairs" in (tmp_path / "out" / "bench.md").read_text()
+    assert found["targets"] == []
+
+
+def test_unknown_names_are_refused_with_what_there_is(tmp_path):
+    with pytest.raises(ValueError, match="no model 'bfdr'; there are lambert"):
+        run.run(replace(TINY, models=("bfdr",)), tmp_path)
+    with pytest.raises(ValueError, match="no material 'jelly'; there are cobbles"):
+        run.run(replace(TINY, materials=("jelly",)), tmp_path)
+
+
+def test_the_verb_prints_one_json_object(tmp_path, capsys):
+    arguments = ["bench", "print", "--model", "lambert", "--size", "16", "--directions", "2"]
+    code = run_cli(btfkit, [*arguments, "-o", str(tmp_path / "b"), "--quick", "--json"])
+    assert code == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["cells"][0]["model"] == "lambert"
+    assert found["machine"]["cores"] >= 1
+    assert len(found["files"]) == 4
+    assert run_cli(btfkit, ["bench", "jelly", "-o", str(tmp_path / "c")]) == 1
+    assert "neither a file nor a material" in capsys.readouterr().err
+
+
+def test_cells_are_told_apart_by_their_keys():
+    models = ("pca", "neumip", "neumip-paper")
+    found = cells.cells_of("a", models, (1.0, 2.0), seed=0, size=64)
+    assert len({cell.key for cell in found}) == len(found)
+    assert sum(cell.budget_cpu_s is None for cell in found) == 6
+    # Every budget of the plain models; of the variants only the longest.
+    assert sum(cell.budget_cpu_s == 1.0 for cell in found) == 2
+
+
+def test_targets_compare_with_the_published_recipe_and_without_offsets():
+    def row(model, budget, mse, **settings):
+        return {
+            "material": "m", "model": model, "settings": settings, "budget_cpu_s": budget,
+            "cpu_seconds": budget, "mse": 2 * mse, "mse_log1p": mse,
+            "psnr_log1p": -10 * np.log10(mse),
+        }  # fmt: skip
+
+    rows = [
+        row("neumip", 5, 4e-3), row("neumip", 60, 1e-3), row("neumip", 60, 3e-3, offset="0"),
+        row("neumip-paper", 60, 2e-3),
+    ]  # fmt: skip
+    first, second = tables.targets(rows)
+    assert first["measured"] == "passed within 60.0 CPU s"
+    assert first["at equal time"] == "+3.01 dB"
+    assert second["measured"] == "3.00 x (log1p), 3.00 x (linear)"
+
+
+@compiled
+@pytest.mark.slow
+def test_kernel_tables_stay_below_the_measured_peak():
+    table = kernels.kernel_table(0.05)
+    for row in table:
+        # The peak is the best of many windows, the rate of a few: noise may lift it by a tenth.
+        assert 0.01 < row["train_share"] < 1.1
+        assert 0.01 < row["evaluate_share"] < 1.1
+    skips = {row["skip"]: row["of_everything"] for row in kernels.skip_table(0.1, size=64)}
+    assert skips["no offset stage"] < 0.9
+    assert skips["16 lights a view, view stage kept"] < 0.8
+    assert all(0 < row["share"] < 1.5 for row in kernels.loop_table(0.05))
+    assert [row["read"] for row in kernels.region_table(0.05)][0] == "whole textures"
+
+
+@compiled
+def test_smaller_textures_change_little():
+    from btfkit.fitting.fit import fit
+
+    case = procedural("print", size=16, directions=4, seed=0)
+    fitted = fit(case.train, model="neumip", steps=50, settings={"batch": "512"}, holdout=0)
+    rows = slice(0, 2000)
+    ask = (case.queries.uv[rows], case.queries.light[rows], case.queries.view[rows], None)
+    table = kernels.precision_table(fitted.material, ask)
+    assert [row["precision"] for row in table] == ["float32", "float16", "int8"]
+    assert table[0]["mae"] == 0
+    assert table[0]["bytes"] > table[1]["bytes"] > table[2]["bytes"]
+    assert table[1]["mae"] < 1e-3
+    assert table[2]["mae"] < 1e-2
