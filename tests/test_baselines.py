@@ -647,7 +647,7 @@ def test_the_universal_encoder_learns_from_several_materials_and_encodes_another
         write(btf, names[name])
     first = tmp_path / "first.safetensors"
     settings = {"materials": str(names["woven"]), "rate": "5e-3", "subset": "32"}
-    fit(btfkit.open(names["knit"]), model="rainer20", steps=400, settings=settings, out=first)
+    fit(btfkit.open(names["knit"]), model="rainer20", steps=200, settings=settings, out=first)
     other = btfkit.open(names["print"])
     plain = fit(other, model="rainer20", steps=0)
     encoded_only = fit(other, model="rainer20", steps=0, settings={"encoder": str(first)})
@@ -668,7 +668,7 @@ def test_rainer19_knows_one_material_only() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["rainer19", "rainer20"])
 def test_autoencoders_beat_lambert(model: str) -> None:
-    steps = {"rainer19": 500, "rainer20": 700}[model]
+    steps = {"rainer19": 300, "rainer20": 400}[model]
     ours = fit(in_memory(), model=model, steps=steps, settings={"rate": "4e-3"}).errors["mse"]
     assert ours < 0.7 * fit(in_memory(), model="lambert").errors["mse"]
 

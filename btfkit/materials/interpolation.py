@@ -20,8 +20,8 @@ from btfkit.queries import Query
 GRAZING = 0.05
 # What a pair of weight 0 answers with where none that has weight is measured.
 _LAST_RESORT = 1e-3
-# Queries looked up at once where the textures lie in memory.
-_BLOCK = 1 << 14
+# Queries looked up at once: where textures are decoded, more of them share each decoding.
+_BLOCK, _LAZY_BLOCK = 1 << 14, 1 << 17
 
 
 @final
@@ -94,8 +94,7 @@ class Interpolation(Material):
 
     def _answer(self, query: Query) -> tuple[Array, Array | None]:
         out = np.empty((len(query.uv), self.spec.channels), np.float32)
-        # A picture of a lazy BTF in one go: each of its textures is decoded once.
-        block = _BLOCK if self._in_memory else max(len(out), 1)
+        block = _BLOCK if self._in_memory else _LAZY_BLOCK
         for start in range(0, len(out), block):
             part = Query(*(values[start : start + block] for values in query))
             out[start : start + block] = self._blended(part)
