@@ -57,7 +57,7 @@ class Settings:
     latents: int = 0
     pairs: int = 32
     texels: int = 32
-    probes: int = 256
+    probes: int = 128
     subset: int = 64
     rate: float = 2e-3
     precision: str = "float16"
