@@ -290,7 +290,8 @@ class NeuMIP(_Trainable):
         arrays["weights"] *= np.float32(1 - rates[0] * self._decay)
         if s.smooth and self._steps % 16 == 0:
             self._smooth(s.smooth * 2 ** (-9 * progress))
-        return loss
+        # A depth that is no number is looked up at a border, with a finite loss: look at weights.
+        return loss if np.isfinite(arrays["weights"]).all() else math.nan
 
     def _batch_size(self, progress: float) -> int:
         if self.settings.batch:
