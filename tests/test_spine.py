@@ -36,9 +36,10 @@ def test_images_become_a_material_that_is_carried_onto_a_new_image(tmp_path: Pat
     assert store.shape == (175, 48, 48, 3)
 
     report = typed(tmp_path, "fit --model neubtf --steps 600 --set texels=256")
-    # Lambert's own error on these held-out pairs is a third larger
-    lambert = typed(tmp_path, "fit folder.btf.zarr --model lambert")
-    assert report["mse"] < 0.75 * lambert["mse"]
+    textures = np.stack([store.texture(pair) for pair in range(len(store))])
+    blind = textures.var(axis=(0, 1, 2)).mean()  # error of the mean colour
+    # 600 steps end at 0.16 of it; an encoder that gave nothing would stay at 1
+    assert report["mse"] < 0.3 * blind
     assert report["parameters"] == 3011
     written = json.loads((tmp_path / "folder.neubtf.report.json").read_text())
     assert written["psnr"] == report["psnr"]
