@@ -684,7 +684,13 @@ def test_settings_take_the_types_of_their_defaults() -> None:
 
 
 def test_reports_of_closed_forms_are_whole(tmp_path: Path) -> None:
-    fit(in_memory(), model="pca", out=tmp_path / "m.safetensors", settings={"rank": "3"})
+    seen: list[tuple[int, int]] = []
+    fit(
+        in_memory(), model="pca", out=tmp_path / "m.safetensors", settings={"rank": "3"},
+        progress=lambda done, total: seen.append((done, total)),
+    )  # fmt: skip
+    assert seen == sorted(seen)
+    assert seen[-1][0] == seen[-1][1]
     report = json.loads((tmp_path / "m.report.json").read_text())
     assert report["model"] == "pca"
     assert report["bytes"] > 0

@@ -88,16 +88,23 @@ def pca(
     """
     s = parsed(Settings, "pca", settings)
     btf = images_of(source, "pca")
-    rows = Rows(btf, s.domain, s.floor, memory=s.memory_mb << 20)  # type: ignore[arg-type]
     n, h, w, c = btf.shape
     groups: list[tuple[int, ...]] = [tuple(range(c))]
     if s.layout == "channels":
         groups = [(k,) for k in range(c)]
+    rows = Rows(
+        btf,
+        "log" if s.domain == "log" else "linear",
+        s.floor,
+        memory=s.memory_mb << 20,
+        passes=1 + s.passes * len(groups),
+        progress=progress,
+    )
     most = [min(n * len(group), h * w) for group in groups]
     wanted, budget = _asked(s, btf, groups, most)
     found = []
     for group, k, limit in zip(groups, wanted, most, strict=True):
-        factors = factorised(rows, group, k, passes=s.passes, progress=progress)
+        factors = factorised(rows, group, k, passes=s.passes)
         while s.error and factors.error(k) > s.error and k < limit:
             k = min(2 * k, limit)
             factors = factorised(rows, group, k, passes=s.passes, start=factors.right)
@@ -180,13 +187,25 @@ class Rows:
     Args:
         btf: what is read, again and again unless it fits in `memory` bytes.
         domain, floor: as in `PCASpec`.
+        passes: that are expected, the first included.
+        progress: called with (pairs gone through in all passes, pairs to go through).
 
     Attributes:
         measured: (n,) pairs of which something is measured.
     """
 
-    def __init__(self, btf: BTF, domain: Domain, floor: float, *, memory: int) -> None:
+    def __init__(
+        self,
+        btf: BTF,
+        domain: Domain,
+        floor: float,
+        *,
+        memory: int,
+        passes: int = 1,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
         self._btf, self._domain, self._floor = btf, domain, floor
+        self._progress, self._done, self._total = progress, 0, passes * len(btf)
         self.shape = btf.shape
         one = 4 * math.prod(btf.shape[1:])
         self._count = max(1, _BLOCK_BYTES // one)
@@ -205,10 +224,14 @@ class Rows:
             block = slice(start, min(start + self._count, len(self._btf)))
             if self._kept is not None and index < len(self._kept):
                 yield block, self._kept[index]
-                continue
-            with ThreadPoolExecutor(native.threads()) as workers:
-                images = list(workers.map(self._read, range(block.start, block.stop)))
-            yield block, np.stack(images)
+            else:
+                with ThreadPoolExecutor(native.threads()) as workers:
+                    images = list(workers.map(self._read, range(block.start, block.stop)))
+                yield block, np.stack(images)
+            self._done += block.stop - block.start
+            if self._progress:
+                # An error asked for may take more passes than were foreseen.
+                self._progress(min(self._done, self._total), self._total)
 
     def _read(self, pair: int) -> Floats:
         image = self._btf.texture(pair)
@@ -250,7 +273,6 @@ def factorised(
     *,
     passes: int,
     start: Floats | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> Factors:
     """The leading components of some channels of a BTF.
 
@@ -258,7 +280,6 @@ def factorised(
         rows: what is factorised. channels: whose rows take part.
         rank: components. passes: over the data.
         start: (texels, k) orthonormal columns to begin with.
-        progress: called with (passes done, passes).
     """
     n, h, w, _ = rows.shape
     k = min(rank + _OVERSAMPLING, n * len(channels), h * w)
@@ -273,8 +294,6 @@ def factorised(
             values = _filled(block, basis if done or start is not None else None)
             image += values.T @ (values @ basis)
         basis = np.linalg.qr(image)[0].astype(np.float32)
-        if progress:
-            progress(done + 1, passes)
     left = np.empty((n * len(channels), k), np.float32)
     energy = 0.0
     for place, block in _matrix(rows, channels):
@@ -282,8 +301,6 @@ def factorised(
         left[place] = values @ basis
         energy += float(np.square(values, dtype=np.float64).sum())
     u, singular, v = np.linalg.svd(left.astype(np.float64), full_matrices=False)
-    if progress:
-        progress(passes, passes)
     return Factors(
         (u * singular)[:, :rank].astype(np.float32),
         (basis @ v.T)[:, :rank].astype(np.float32),
