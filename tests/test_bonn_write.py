@@ -222,12 +222,15 @@ def test_equal_seeds_give_equal_bytes(tmp_path: Path) -> None:
 class Endless(Textures):
     """Many images made when they are asked for: 79 MB if they were all kept."""
 
+    reads = 0
+
     def __init__(self, pairs: int) -> None:
         self.shape = (pairs, 64, 64, 3)
         rng = np.random.default_rng(0)
         self._basis = rng.random((4, 64, 64, 3), np.float32)
 
     def _read(self, index: int) -> Array:
+        self.reads += 1
         weights = np.cos(index * np.arange(1, 5, dtype=np.float32)) ** 2
         return np.einsum("k,khwc->hwc", weights, self._basis)
 
@@ -236,6 +239,7 @@ def test_memory_is_bounded_by_factors_and_a_block_of_images(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bonn_rows, "_AT_ONCE", 1 << 20)
+    monkeypatch.setattr(bonn_rows, "_KEPT", 0)
     table = directions.bonn81()[:40]
     light, view = np.tile(table, (40, 1)), np.repeat(table, 40, axis=0)
     btf = BTF(textures=Endless(len(light)), light=light, view=view)
@@ -247,6 +251,23 @@ def test_memory_is_bounded_by_factors_and_a_block_of_images(
     # Some copies of a block of 1 MB in work, and 20 vectors of 4800 rows and 4096 texels.
     assert peak < 8e6
     assert len(btfkit.open(tmp_path / "a.btf")) == 1600
+
+
+def test_a_small_btf_is_read_once_and_a_large_one_once_a_pass_to_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = directions.bonn81()[:6]
+    light, view = np.tile(table, (6, 1)), np.repeat(table, 6, axis=0)
+    monkeypatch.setattr(bonn_rows, "_AT_ONCE", 1 << 18)
+    reads = []
+    for kept in (1 << 29, 0):
+        monkeypatch.setattr(bonn_rows, "_KEPT", kept)
+        textures = Endless(36)
+        btf = BTF(textures=textures, light=light, view=view)
+        bonn_write.write(btf, tmp_path / f"{kept}.btf", rank=3)
+        reads.append(textures.reads)
+    assert reads == [36, 3 * 36]
+    assert (tmp_path / "0.btf").read_bytes() == (tmp_path / f"{1 << 29}.btf").read_bytes()
 
 
 def test_tracked_vectors_grow_without_losing_those_found() -> None:

@@ -20,6 +20,8 @@ Index = NDArray[np.intp]
 
 # Images in work, bytes.
 _AT_ONCE = 1 << 25
+# Rows that are kept between passes, bytes; what is larger is read again.
+_KEPT = 1 << 29
 # Images that the axes of PCA are found from.
 _SAMPLE = 32
 _OF_RGB = (1, 2, 3, 4, 9, 10, 11)
@@ -49,6 +51,7 @@ class Rows:
         n, h, w, c = btf.shape
         self.shapes = [(n * c, h * w)] if kind == "fmf" else [(n, h * w)] * c
         self.negative = 0
+        self._kept: list[list[Array]] = []
         self._mean, self._transform = np.zeros(3), np.eye(3)
         if kind == "dfmf":
             if model in _OF_RGB and c != 3:
@@ -85,12 +88,20 @@ class Rows:
         Args:
             advance: told how many images each step was.
         """
-        self.negative = 0
-        _, h, w, c = self._btf.shape
+        n, h, w, c = self._btf.shape
         step = max(1, _AT_ONCE // (4 * h * w * c))
-        for start in range(0, len(self._order), step):
+        keep = 4 * n * h * w * c <= _KEPT
+        if not self._kept:
+            self.negative = 0
+        for number, start in enumerate(range(0, n, step)):
             pairs = self._order[start : start + step]
-            yield self._encoded(self._planes(pairs))
+            if number < len(self._kept):
+                blocks = self._kept[number]
+            else:
+                blocks = self._encoded(self._planes(pairs))
+                if keep:
+                    self._kept.append(blocks)
+            yield blocks
             advance(len(pairs))
 
     def warn(self, out: str | os.PathLike[str]) -> None:

@@ -53,7 +53,9 @@ def write(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Written:
-    """Write a BTF as a truncated factorisation; memory is bounded by the factors.
+    """Write a BTF as a truncated factorisation.
+
+    Memory is bounded by the factors, a block of images, and 512 MB that are kept between passes.
 
     Args:
         btf: every light with every view, no value missing.
