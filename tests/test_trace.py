@@ -295,6 +295,15 @@ def test_directions_on_the_horizon_end_and_answer() -> None:
             assert np.isfinite(rgb).all()
 
 
+def test_directions_of_denormal_slope_end_and_answer() -> None:
+    # From a texel centre, 0 times the inverse of a denormal decides the first cell.
+    relief = procedural.make("cobbles", 32)
+    for tiny in (1e-39, -1e-39):
+        for tilt in ([tiny, 0, 1], [0, tiny, 1], [tiny, tiny, 1]):
+            rgb, _ = trace.answer(relief, [4.5 / 32, 7.5 / 32], tilt, tilt, samples=1, bounces=1)
+            assert np.isfinite(rgb).all()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -113,7 +113,9 @@ typedef int Steps __attribute__((vector_size(16)));
 // First crossing from above to below of at + t (da, db, dz), 0 <= t <= most.
 inline Hit march(const Relief& r, const Ray& ray, float most) {
   const float da = ray.da, db = ray.db;
-  const float pa = da != 0 ? 1 / std::fabs(da) : kInf, pb = db != 0 ? 1 / std::fabs(db) : kInf;
+  // Bounded: 0 times the inverse of a denormal must not be NaN, or the way would never end.
+  const float pa = da != 0 ? std::min(1 / std::fabs(da), kInf) : kInf;
+  const float pb = db != 0 ? std::min(1 / std::fabs(db), kInf) : kInf;
   const Pair pace{pa, pb, kInf, kInf};
   const Steps step{da > 0 ? 1 : -1, db > 0 ? 1 : -1, 0, 0};
   Pair leave{da != 0 ? (da > 0 ? 1 - ray.at.a : ray.at.a) * pa : kInf,

@@ -186,7 +186,7 @@ def sent(relief: Geometry, patch: Patch, at: Point, d: Floats, alive: Bools) -> 
 
 
 def _plane(relief: Geometry, at: Point, d: Floats) -> Hit:
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         down, up = (at.z - relief.lowest) / -d[:, 2], (relief.highest - at.z) / d[:, 2]
         last = np.where(d[:, 2] < 0, down, np.where(d[:, 2] > 0, up, FAR))
     most = np.minimum(np.maximum(last, 0), FAR).astype(np.float32) + 1
@@ -275,7 +275,7 @@ class Line(NamedTuple):
 
 def march(relief: Geometry, at: Point, da: Floats, db: Floats, dz: Floats, most: Floats) -> Hit:
     """First crossing from above to below of at + t (da, db, dz), 0 <= t <= most."""
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", over="ignore"):
         pa, pb = (np.minimum(1 / np.abs(d), INF).astype(np.float32) for d in (da, db))
     ta = np.where(da != 0, np.where(da > 0, 1 - at.a, at.a) * pa, INF).astype(np.float32)
     tb = np.where(db != 0, np.where(db > 0, 1 - at.b, at.b) * pb, INF).astype(np.float32)
