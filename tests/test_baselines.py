@@ -23,9 +23,9 @@ from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting import loop, pca, rainer
 from btfkit.fitting.autoencoder import Decoder, SetEncoder
+from btfkit.fitting.factorisation import Rows, factorised
 from btfkit.fitting.fit import fit, split
 from btfkit.fitting.lambert import lambert
-from btfkit.fitting.pca import Rows, factorised
 from btfkit.fitting.settings import parsed
 from btfkit.io.store_write import write
 from btfkit.materials.bilinear import corners, lookup
@@ -512,7 +512,7 @@ def test_missing_values_are_filled_from_what_the_rest_says() -> None:
 
 def test_pca_streams_what_does_not_fit_and_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = fit(in_memory(), model="pca", settings={"rank": "5"}).material
-    monkeypatch.setattr("btfkit.fitting.pca._BLOCK_BYTES", 20_000)
+    monkeypatch.setattr("btfkit.fitting.factorisation._BLOCK_BYTES", 20_000)
     streamed = fit(in_memory(), model="pca", settings={"rank": "5", "memory_mb": "0"}).material
     for pair in (3, 90):
         # sums in another order
