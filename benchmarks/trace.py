@@ -125,7 +125,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="fewer queries and rounds")
     parser.add_argument("--json", action="store_true", help="one JSON object")
     options = parser.parse_args()
-    count, rounds = (100_000, 3) if options.quick else (1_000_000, 7)
+    count, rounds = (100_000, 3) if options.quick else (300_000, 5)
     if native.load("trace") is None:
         raise SystemExit("the tracing kernel was not built: this measures the compiled form")
     before = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
