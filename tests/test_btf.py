@@ -133,3 +133,15 @@ def test_xarray_reads_only_the_pair_that_is_taken() -> None:
     )
     assert data.attrs["texel_mm"] == 0.5
     assert data["view"].dims == ("pair", "xyz")
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_batch_is_its_textures_masks_included(whole: bool) -> None:
+    rng = np.random.default_rng(0)
+    validity = rng.random((1 if whole else 5, 4, 6)) > 0.3
+    btf = BTF(
+        rng.random((5, 4, 6, 2), np.float32), np.tile([0, 0, 1.0], (5, 1)),
+        np.tile([0, 0, 1.0], (5, 1)), channels=("a", "b"), validity=validity,
+    )  # fmt: skip
+    pairs = [3, 0, 3, 4]
+    np.testing.assert_array_equal(btf.batch(pairs), np.stack([btf.texture(i) for i in pairs]))

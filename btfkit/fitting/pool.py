@@ -7,7 +7,8 @@ seed and step alone, so a resumed run sees the same data.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import final
 
@@ -21,6 +22,8 @@ from btfkit.errors import FitError
 DEFAULT_BYTES = 1 << 30
 # Steps after which a part of a pool that does not hold everything is replaced.
 _REFRESH_STEPS = 64
+# Textures decoded at once: what factorised files multiply out in one go.
+_BATCH = 16
 
 
 @final
@@ -63,7 +66,7 @@ class Pool:
             raise FitError("no texel of any texture is measured (all are NaN)")
         self._moved = 0
         self._worker = None if self.whole else ThreadPoolExecutor(1)
-        self._coming: Future[list[NDArray[np.float32]]] | None = None
+        self._coming: Future[NDArray[np.float32]] | None = None
 
     def at_step(self, step: int) -> None:
         """Bring the pool to what it holds at `step`; a resumed run may jump ahead."""
@@ -76,7 +79,7 @@ class Pool:
             first = len(self.pairs) + self._moved
             coming = self._coming or self._worker.submit(self._decode, first)
             slots = np.arange(first, first + self._quota) % len(self.pairs)
-            self.images[slots] = np.stack(coming.result())
+            self.images[slots] = coming.result()
             self.pairs[slots] = self._sequence(first, self._quota)
             self._moved += self._quota
             self._coming = self._worker.submit(self._decode, first + self._quota)
@@ -94,8 +97,8 @@ class Pool:
         start = first - epochs[0] * m
         return joined[start : start + count]
 
-    def _decode(self, first: int) -> list[NDArray[np.float32]]:
-        return [self._btf.texture(int(pair)) for pair in self._sequence(first, self._quota)]
+    def _decode(self, first: int) -> NDArray[np.float32]:
+        return self._btf.batch(self._sequence(first, self._quota))
 
     def _jump(self, due: int) -> None:
         self._moved = due
@@ -109,14 +112,31 @@ class Pool:
     ) -> NDArray[np.float16] | NDArray[np.float32]:
         shape = (len(self.pairs), *self._btf.shape[1:])
         images: NDArray[np.float16] | NDArray[np.float32] = np.empty(shape, np.float16)
+        parts = [self.pairs[at : at + _BATCH] for at in range(0, len(self.pairs), _BATCH)]
+        filled = 0
         with ThreadPoolExecutor(native.threads()) as workers:
-            decoded = workers.map(self._btf.texture, (int(pair) for pair in self.pairs))
-            for slot, image in enumerate(decoded):
-                finite = np.isfinite(image)
+            for batch in _ahead(workers, self._btf.batch, parts):
+                finite = np.isfinite(batch)
                 self.masked += int((~finite).any(axis=-1).sum())
-                if images.dtype == np.float16 and (np.abs(image) > 6e4).any(where=finite):
+                if images.dtype == np.float16 and (np.abs(batch) > 6e4).any(where=finite):
                     images = images.astype(np.float32)
-                images[slot] = np.where(finite, image, np.nan)
+                images[filled : filled + len(batch)] = np.where(finite, batch, np.nan)
+                filled += len(batch)
                 if progress:
-                    progress(slot + 1, len(self.pairs))
+                    progress(filled, len(self.pairs))
         return images
+
+
+def _ahead(
+    workers: ThreadPoolExecutor,
+    decode: Callable[[NDArray[np.intp]], NDArray[np.float32]],
+    parts: Sequence[NDArray[np.intp]],
+) -> Iterator[NDArray[np.float32]]:
+    """Decoded parts in order, never more than a few ahead of who takes them."""
+    coming: deque[Future[NDArray[np.float32]]] = deque()
+    for part in parts:
+        coming.append(workers.submit(decode, part))
+        if len(coming) > 2 * native.threads():
+            yield coming.popleft().result()
+    while coming:
+        yield coming.popleft().result()

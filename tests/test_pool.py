@@ -1,0 +1,100 @@
+"""The pool of textures that batches are drawn from: whole, or a window that moves."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from btfkit import native
+from btfkit.btf import BTF
+from btfkit.errors import FitError
+from btfkit.fitting import pool
+from btfkit.fitting.pool import Pool
+from btfkit.textures import Textures
+
+ONE = 6 * 5 * 3 * 2  # bytes of a texture, float16
+
+
+class Numbered(Textures):
+    """Textures that are filled with their own index; counts what is decoded."""
+
+    def __init__(self, n: int) -> None:
+        self.shape = (n, 6, 5, 3)
+        self.read: list[int] = []
+        self._lock = threading.Lock()
+
+    def _read(self, index: int) -> np.ndarray:
+        with self._lock:
+            self.read.append(index)
+        return np.full(self.shape[1:], index, np.float32)
+
+
+def numbered(n: int) -> tuple[BTF, Numbered]:
+    textures = Numbered(n)
+    up = np.tile([0, 0, 1.0], (n, 1))
+    return BTF(textures, up, up), textures
+
+
+def test_what_fits_is_decoded_once_and_stays() -> None:
+    btf, textures = numbered(50)
+    found = Pool(btf, np.arange(10, 50), seed=0)
+    assert sorted(textures.read) == list(range(10, 50))
+    np.testing.assert_array_equal(found.images[:, 0, 0, 0], found.pairs)
+    found.at_step(10_000)
+    assert len(textures.read) == 40
+
+
+def test_a_small_pool_holds_no_more_than_it_may_and_comes_to_see_everything() -> None:
+    btf, textures = numbered(60)
+    found = Pool(btf, np.arange(60), seed=3, most_bytes=16 * ONE)
+    assert found.images.nbytes == 16 * ONE
+    seen = set(found.pairs.tolist())
+    for step in range(0, 64 * 60, 64):
+        found.at_step(step)
+        np.testing.assert_array_equal(found.images[:, 0, 0, 0], found.pairs)
+        seen |= set(found.pairs.tolist())
+    assert seen == set(range(60))
+    assert len(textures.read) <= 16 + 60 + 1
+
+
+@pytest.mark.parametrize("steps", [[0, 64, 128, 640], [640], [100, 639, 641]])
+def test_what_a_pool_holds_is_a_function_of_seed_and_step(steps: list[int]) -> None:
+    held = []
+    for visited in ([*range(0, 641, 64), 641], [*steps, 641]):
+        found = Pool(numbered(40)[0], np.arange(40), seed=5, most_bytes=8 * ONE)
+        for step in visited:
+            found.at_step(step)
+        held.append(found.pairs.tolist())
+        np.testing.assert_array_equal(found.images[:, 0, 0, 0], found.pairs)
+    assert held[0] == held[1]
+
+
+def test_decoding_never_runs_far_ahead_of_who_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    btf, textures = numbered(400)
+    taken: list[int] = []
+
+    def progress(done: int, total: int) -> None:
+        taken.append(len(textures.read) - done)
+
+    Pool(btf, np.arange(400), seed=0, progress=progress)
+    assert max(taken) <= (2 * native.threads() + 1) * pool._BATCH
+
+
+def test_values_past_half_range_make_the_pool_float32() -> None:
+    images = np.ones((3, 2, 2, 1), np.float32)
+    images[1, 0, 0] = 7e4
+    images[2, 1, 1] = np.inf
+    up = np.tile([0, 0, 1.0], (3, 1))
+    found = Pool(BTF(images, up, up, channels=("grey",)), np.arange(3), seed=0)
+    assert found.images.dtype == np.float32
+    assert found.images[1, 0, 0, 0] == 7e4
+    assert np.isnan(found.images[2, 1, 1, 0])
+    assert found.masked == 1
+
+
+def test_nothing_measured_is_told() -> None:
+    up = np.tile([0, 0, 1.0], (2, 1))
+    with pytest.raises(FitError, match=r"no texel of any texture is measured \(all are NaN\)"):
+        Pool(BTF(np.full((2, 3, 3, 3), np.nan, np.float32), up, up), np.arange(2), seed=0)
