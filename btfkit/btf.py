@@ -130,13 +130,14 @@ class BTF:
         pairs = np.arange(len(self))
         return self.texels(pairs, np.full_like(pairs, row), np.full_like(pairs, col))
 
-    def subset(self, pairs: ArrayLike) -> BTF:
+    def subset(self, pairs: ArrayLike | slice) -> BTF:
         """The BTF of the given pairs only, in that order; nothing else is decoded.
 
         Args:
-            pairs: indices, or a (n,) bool mask.
+            pairs: indices, a (n,) bool mask, or a slice.
         """
-        index: Index = np.arange(len(self))[np.asarray(pairs)]
+        everything: Index = np.arange(len(self))
+        index = everything[pairs] if isinstance(pairs, slice) else everything[np.asarray(pairs)]
         if index.size == 0:
             raise ValueError(f"no pair of {len(self)} is left")
 

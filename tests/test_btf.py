@@ -145,3 +145,15 @@ def test_a_batch_is_its_textures_masks_included(whole: bool) -> None:
     )  # fmt: skip
     pairs = [3, 0, 3, 4]
     np.testing.assert_array_equal(btf.batch(pairs), np.stack([btf.texture(i) for i in pairs]))
+
+
+def test_a_subset_by_slice_mask_or_index_is_the_same() -> None:
+    light = np.random.default_rng(0).normal(size=(6, 3)) + [0, 0, 4]
+    btf = BTF(np.arange(6.0)[:, None, None, None] + np.zeros((6, 2, 2, 3)), light, light)
+    mask = np.array([False, True, False, True, False, True])
+    for pairs in (slice(1, None, 2), mask, [1, 3, 5]):
+        found = btf.subset(pairs)
+        np.testing.assert_array_equal(found.light, btf.light[1::2])
+        assert found.texture(2)[0, 0, 0] == 5
+    with pytest.raises(ValueError, match="no pair of 6 is left"):
+        btf.subset(slice(3, 3))

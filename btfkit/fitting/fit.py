@@ -66,13 +66,14 @@ class FitReport:
         return {"model": self.material.model, **self.errors, **rest}
 
     def line(self) -> str:
-        """One line for people."""
+        """For people: one line, and one for each reason of `auto`."""
         psnr = self.errors.get("psnr")
         error = "no held-out data" if psnr is None else f"held-out PSNR {psnr:.2f} dB"
-        return (
+        line = (
             f"{self.out or self.material.model}: {error}, {self.steps} steps in "
             f"{self.seconds:.1f} s, {self.parameters} weights, {self.bytes / 1e6:.2f} MB"
         )
+        return "\n  ".join([line, *self.choice])
 
 
 def fit(

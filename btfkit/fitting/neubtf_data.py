@@ -60,9 +60,10 @@ def first_latents(images: NDArray[Any], count: int, *, deviation: float, seed: i
     for slot in chosen:
         image = np.asarray(images[slot], np.float32)
         image = np.log1p(np.maximum(image, -0.1)).reshape(-1, image.shape[-1])
+        measured = np.isfinite(image)
+        mean = np.where(measured, image, 0).sum(axis=0) / np.maximum(measured.sum(axis=0), 1)
         # A texel that was not measured is taken as the mean: it leans nowhere.
-        mean = np.nan_to_num(np.nanmean(np.where(np.isfinite(image), image, np.nan), axis=0))
-        columns.append(np.where(np.isfinite(image), image - mean, 0))
+        columns.append(np.where(measured, image - mean, 0))
     table = np.concatenate(columns, axis=1)
     _, vectors = np.linalg.eigh((table.T @ table).astype(np.float64))
     scores = table @ vectors[:, ::-1][:, :count].astype(np.float32)
