@@ -523,6 +523,8 @@ def test_a_row_past_the_silhouette_is_nothing_seen_nowhere() -> None:
 def test_curvature_that_reaches_the_axis_and_reliefs_above_their_surface_are_refused() -> None:
     with pytest.raises(ValueError, match=r"curvature 20 / tile bends a relief.*at most 18 here"):
         trace.answer(_sunk(0.05), [0.5, 0.5], UP, UP, 0.5, 20.0)
+    with pytest.raises(ValueError, match=r"curvature -1e\+30 / tile: .* at most 64 here"):
+        trace.answer(_sunk(0.0), [0.5, 0.5], UP, UP, 0.5, -1e30)
     with pytest.raises(ValueError, match=r"stands 3.2 texels above.*take relief.under_surface"):
         trace.silhouette(surface(np.full((8, 64), 0.05)), [0.5, 0.5], 0.0, 1.0)
     with pytest.raises(ValueError, match="curvatures 2, 1; expected 0 < low <= high"):
@@ -569,3 +571,19 @@ def test_a_sample_that_does_not_tile_is_seen_at_its_border_from_outside() -> Non
         for uv in ([[1.0, 0.2], [0.0, 0.9]], [[1.7, 0.2], [-4.0, 0.9]])
     )
     np.testing.assert_array_equal(inside, outside)
+
+
+def test_extremes_of_curvature_and_of_views_on_cylinders_end_and_answer() -> None:
+    rng = np.random.default_rng(4)
+    for depth in (0.0, 0.01):
+        relief = surface(-depth * rng.random((16, 16)), specular=0.5, rough=0.05)
+        light, view = trace._on_sphere(rng, 200, -1), trace._on_sphere(rng, 200, 0)
+        view[:40, 2], view[40:80, :2], light[80:120, 2] = 0, 0, 0
+        for curvature in (1e-30, 1e-3, 16.0, -1e-30, -1e-3, -16.0):
+            rgb, opacity = trace.answer(
+                relief, rng.random((200, 2)), light, directions.normalize(view), 0.5, curvature,
+                samples=2, bounces=2,
+            )  # fmt: skip
+            assert np.isfinite(rgb).all()
+            assert (rgb >= 0).all()
+            assert ((opacity >= 0) & (opacity <= 1)).all()

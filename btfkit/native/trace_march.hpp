@@ -15,6 +15,7 @@ constexpr float kInf = 1e30f;
 constexpr float kFar = 1e6f;          // a ray that has gone so far without a hit has left, texels
 constexpr float kSag = 1.0f / 256;    // most that a piece of a curved path leaves it, texels
 constexpr float kBend = 0.25f;        // most that such a piece turns, radians
+constexpr float kLongest = 1024;      // and its length: cells are counted in fractions of it, texels
 
 struct Vec { float x, y, z; };        // surface frame: x right, y up, z out
 
@@ -203,7 +204,8 @@ inline Bent march_bent(const Relief& r, const Patch& p, Point at, Vec d) {
   const Line line(p, at.z, d);
   const float thin = std::min(1 + p.k * r.lowest, 1 + p.k * r.highest), bend = std::fabs(p.k);
   const float flat = std::max(std::sqrt(line.q), 1e-3f);
-  const float piece = thin * std::min(std::sqrt(8 * kSag / bend), kBend / bend) / flat;
+  const float sagging = thin * std::min(std::sqrt(8 * kSag / bend), kBend / bend) / flat;
+  const float piece = std::min(sagging, kLongest);
   Line::At from{0, 0, 0, {}};
   Point here = at;
   for (float t = 0; t < kFar;) {

@@ -22,8 +22,8 @@ Ints = NDArray[np.int64]
 INF = 1e30
 # A ray that has gone so far without a hit has left, texels.
 FAR = 1e6
-# Most that a piece of a curved path leaves it, texels; most that it turns, radians.
-SAG, BEND = 1 / 256, 0.25
+# Most that a piece of a curved path leaves it, texels; that it turns, radians; its length, texels.
+SAG, BEND, LONGEST = 1 / 256, 0.25, 1024.0
 # Steps of the table of cells over the range of heights.
 LEVELS = 253
 
@@ -203,7 +203,7 @@ def bent(relief: Geometry, patch: Patch, at: Point, d: Floats) -> Hit:
     bend = np.abs(patch.k)
     thin = np.minimum(1 + patch.k * relief.lowest, 1 + patch.k * relief.highest)
     flat = np.maximum(np.sqrt(line.q), 1e-3)
-    piece = thin * np.minimum(np.sqrt(8 * SAG / bend), BEND / bend) / flat
+    piece = np.minimum(thin * np.minimum(np.sqrt(8 * SAG / bend), BEND / bend) / flat, LONGEST)
     t, start = np.zeros_like(piece), line.at(np.zeros_like(piece))
     here = at.take(np.arange(len(at.z)))
     hit = Hit(np.zeros(len(t), bool), here, np.ones_like(t), start.turn.copy())

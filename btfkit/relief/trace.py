@@ -64,7 +64,8 @@ def trace(
         that are not finite, or seen from below the horizon, answer 0 with opacity 0.
 
     Raises:
-        ValueError: a curvature at which the relief reaches the axis of its cylinder.
+        ValueError: a curvature at which the relief reaches the axis of its cylinder, or whose
+            radius is under a texel.
     """
     packed = relief if isinstance(relief, Geometry) else geometry(relief)
     h, w = packed.height.shape
@@ -93,12 +94,20 @@ def trace(
 _FARTHEST = 1e12
 # Share of its radius that a cylinder keeps at the lowest (or, concave, highest) relief.
 _LEAST_RADIUS = 0.1
+# 1/texel.
+_SHARPEST = 1.0
 
 
 def _check_curvature(relief: Geometry, curvature: Array) -> None:
     if not np.any(curvature):
         return
     sharpest = [curvature.min(), curvature.max()]
+    if max(map(abs, sharpest)) > _SHARPEST:
+        w = relief.height.shape[1]
+        raise ValueError(
+            f"curvature {max(sharpest, key=abs) * w:g} / tile: the cylinder is thinner than a "
+            f"texel; at most {_SHARPEST * w:g} here"
+        )
     thin = [1 + k * z for k in sharpest for z in (relief.lowest, relief.highest)]
     if min(thin) < _LEAST_RADIUS:
         worst = sharpest[int(np.argmin(thin)) // 2] * relief.height.shape[1]
