@@ -188,11 +188,12 @@ def test_data_of_any_number_of_channels_guide_and_are_fitted(channels: int) -> N
 
 
 def test_a_fit_beats_lambert_on_a_tiny_btf() -> None:
-    tiny = synth_btf("woven", size=32, lights="25", views="9", samples=2, relief_texels=0.5)
+    tiny = synth_btf("scratched", size=32, lights="25", views="9", samples=2, relief_texels=0.1)
     settings = {"encoder": "false", "texels": "256"}
     report = fit.fit(tiny, model="neubtf", steps=600, settings=settings)
     lambert = fit.fit(tiny, model="lambert")
-    assert report.errors["mse"] < 0.7 * lambert.errors["mse"]
+    # gloss that lambert cannot hold: a tenth of its error in 600 steps
+    assert report.errors["mse"] < 0.3 * lambert.errors["mse"]
 
 
 def test_first_latents_are_principal_components_of_what_was_measured() -> None:
