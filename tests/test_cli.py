@@ -216,9 +216,10 @@ def test_interruption_exits_130_and_keeps_what_was_finished(tmp_path: Path) -> N
         assert process.stdout is not None
         assert process.stdout.readline() == b"five\n"
         process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 130
         assert process.stderr is not None
-        assert b"interrupted; what was finished is kept" in process.stderr.read()
+        said = process.stderr.read()
+        assert process.wait(30) == 130, said
+        assert b"interrupted; what was finished is kept" in said
     assert not (tmp_path / "a.btf.zarr").exists()
     assert (tmp_path / ".a.btf.zarr.partial" / "journal.jsonl").is_file()
 
@@ -271,3 +272,14 @@ def test_settings_become_the_options_of_a_writer() -> None:
     assert matched(write, {"rank": "64", "log": "false"}) == {"rank": 64, "log": False}
     with pytest.raises(ValueError, match="no setting force; there are rank, log"):
         matched(write, {"force": "true"})
+
+
+def test_an_interruption_that_a_library_wrapped_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    def wrapped(*_: object, **__: object) -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise RuntimeError("cannot schedule new futures") from error
+
+    monkeypatch.setattr("btfkit.open", wrapped, raising=False)
+    assert call("convert", "a", "-o", "b", "--as", "utia") == 130

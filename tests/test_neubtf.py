@@ -16,13 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import btfkit
-from btfkit import propagation
+from btfkit import directions, propagation
 from btfkit.btf import BTF
 from btfkit.errors import FitError, FormatError
-from btfkit.fitting import augment, fit, guides, loop, losses, neubtf, neubtf_data
+from btfkit.fitting import augment, fit, guides, loop, losses, neubtf, neubtf_data, siren
 from btfkit.fitting.siren import Renderer
 from btfkit.fitting.unet import STRIDE, Encoder
-from btfkit.materials.neubtf import NeuBTFSpec, renderer_shapes
+from btfkit.materials.neubtf import NeuBTFSpec, on_disc, renderer_shapes
 from btfkit.relief.synth import synth_btf
 
 TINY: dict[str, str] = {"texels": "64", "pairs": "4"}
@@ -77,6 +77,15 @@ def test_numpy_answers_as_torch_does(parallax: str, wrap: Any) -> None:
         rgb = material.evaluate(uv, btf.light[pair], btf.view[pair]).reflectance
         # float32 through three sine layers
         np.testing.assert_allclose(rgb, np.maximum(np.expm1(ours[0].numpy()), 0), atol=2e-5)
+
+
+@given(st.floats(0, math.pi / 2), st.floats(-math.pi, math.pi))
+def test_directions_lie_on_the_disc_by_their_angle(theta: float, phi: float) -> None:
+    direction = directions.from_angles(theta, phi)[None].astype(np.float32)
+    expected = 2 / math.pi * theta * np.array([math.cos(phi), math.sin(phi)])
+    # float32
+    np.testing.assert_allclose(on_disc(direction)[0], expected, atol=1e-6)
+    np.testing.assert_allclose(siren.on_disc(torch.from_numpy(direction))[0], expected, atol=1e-6)
 
 
 def test_texel_centres_answer_their_own_texel_and_between_them_latents_mix(fitted: Path) -> None:

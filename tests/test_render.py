@@ -832,7 +832,7 @@ def test_spectral_pictures_are_shown_as_seen_under_daylight() -> None:
         colour.SpectralShape(400, 700, 1), interpolator=colour.LinearInterpolator
     ).extrapolate(grid)
     lamp = colour.SDS_ILLUMINANTS["D65"].copy().align(grid)
-    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(grid)
     expected = colour.sd_to_XYZ(spectrum, observer, lamp, method="Integration") / 100
     expected = colour.XYZ_to_RGB(expected, "sRGB")
     # Two tables of the same D65 and matrices of four to ten digits.

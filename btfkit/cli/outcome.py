@@ -99,8 +99,22 @@ def run(group: click.Group, arguments: Sequence[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except Exception as error:  # the last place that can answer for it
+        if _was_interrupted(error):
+            return _failed("Interrupted", "interrupted; what was finished is kept", INTERRUPTED)
         return _failed(type(error).__name__, _message(error), FAILED)
     return DONE
+
+
+def _was_interrupted(error: BaseException) -> bool:
+    """Whether an interruption stands behind an error, as where a library wraps all it meets."""
+    seen: list[BaseException] = []
+    behind: BaseException | None = error
+    while behind is not None and behind not in seen:
+        if isinstance(behind, KeyboardInterrupt):
+            return True
+        seen.append(behind)
+        behind = behind.__cause__ or behind.__context__
+    return False
 
 
 def _message(error: Exception) -> str:

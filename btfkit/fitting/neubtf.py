@@ -27,7 +27,7 @@ from btfkit.fitting.neubtf_data import Directions, HeldOut, first_latents, front
 from btfkit.fitting.neubtf_settings import Settings
 from btfkit.fitting.pool import Pool
 from btfkit.fitting.settings import parsed
-from btfkit.fitting.siren import ParallaxHead, Renderer
+from btfkit.fitting.siren import ParallaxHead, Renderer, on_disc
 from btfkit.fitting.unet import Encoder
 from btfkit.materials import neubtf as evaluated
 from btfkit.materials.base import Header
@@ -317,7 +317,7 @@ class NeuBTF(Trainable):
             row = rows - shift[..., 1] * texels
             col = cols + shift[..., 0] * texels
             latents = _bilinear(texture, row, col, size, wrap=self._wrap or window is not None)
-        return self.renderer(latents, light[..., :2], view[..., :2])
+        return self.renderer(latents, on_disc(light), on_disc(view))
 
     def _in_grid(self, rows: Tensor, cols: Tensor, window: Window) -> tuple[Tensor, Tensor]:
         h, w = self.spec.size

@@ -12,6 +12,14 @@ from torch import Tensor, nn
 from btfkit.materials.neubtf import HIDDEN, NeuBTFSpec
 
 
+def on_disc(direction: Tensor) -> Tensor:
+    """Twin of `materials.neubtf.on_disc`: directions (..., 3) to (..., 2)."""
+    tangential = torch.hypot(direction[..., 0], direction[..., 1])
+    angle = torch.atan2(tangential, direction[..., 2])
+    stretch = torch.where(tangential > 1e-6, angle / tangential.clamp_min(1e-6), 1.0)
+    return direction[..., :2] * (stretch * (2 / math.pi))[..., None]
+
+
 @final
 class Renderer(nn.Module):
     """18 -> 32 -> 32 -> 32 -> c with LayerNorm, sines and residuals: 3011 weights for c = 3.
@@ -41,7 +49,7 @@ class Renderer(nn.Module):
         """log(1 + rgb).
 
         Args:
-            latents: (..., latents); light, view: (..., 2) x and y of unit vectors, broadcasting.
+            latents: (..., latents); light, view: (..., 2) as `on_disc` gives them, broadcasting.
 
         Returns:
             (..., c).

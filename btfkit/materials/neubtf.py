@@ -47,7 +47,7 @@ class NeuBTFSpec:
 
 
 def renderer_shapes(spec: NeuBTFSpec) -> dict[str, tuple[int, ...]]:
-    """Shapes of the renderer's weights: inputs are latents, light x y, view x y."""
+    """Shapes of the renderer's weights: inputs are latents, light and view on the disc."""
     shapes: dict[str, tuple[int, ...]] = {}
     before = spec.latents + 4
     for layer in range(HIDDEN):
@@ -59,6 +59,18 @@ def renderer_shapes(spec: NeuBTFSpec) -> dict[str, tuple[int, ...]]:
     shapes["renderer.out.weight"] = (spec.channels, spec.width)
     shapes["renderer.out.bias"] = (spec.channels,)
     return shapes
+
+
+def on_disc(direction: Array) -> Array:
+    """(..., 2) directions (..., 3) on the unit disc: azimuth kept, radius 2/pi x polar angle.
+
+    In x and y alone the cosine has an infinite slope at the horizon; in the angle it is smooth.
+    """
+    tangential = np.hypot(direction[..., 0], direction[..., 1])
+    angle = np.arctan2(tangential, direction[..., 2])
+    # At the pole angle / sine is 1.
+    stretch = np.where(tangential > 1e-6, angle / np.maximum(tangential, 1e-6), 1)
+    return direction[..., :2] * (stretch * (2 / np.pi)).astype(np.float32)[..., None]
 
 
 def parallax_shapes(spec: NeuBTFSpec) -> dict[str, tuple[int, ...]]:
@@ -111,7 +123,7 @@ class NeuBTF(Material):
         uv = query.uv
         if self.spec.parallax:
             uv = self._shifted(uv, query.view)
-        x = np.concatenate([self._lookup(uv), query.light[:, :2], query.view[:, :2]], axis=1)
+        x = np.concatenate([self._lookup(uv), on_disc(query.light), on_disc(query.view)], axis=1)
         for layer in range(HIDDEN):
             z = self._normalised(layer, self._linear(f"renderer.{layer}", x))
             activation = np.sin(np.float32(self.spec.omega) * z)
