@@ -33,6 +33,7 @@ from btfkit.materials.neubtf import NeuBTF
 Array = NDArray[np.float32]
 # A guidance of more texels needs more memory for its encoder than most machines have.
 _MOST_TEXELS = 1 << 25
+_COMPARED = 256
 
 
 def propagate(
@@ -157,19 +158,22 @@ def prepare(image: Array, *, scale: float = 1.0, wrap: bool = False) -> torch.Te
     return augment.resized(augment.encoded(augment.three_channels(tensor)), size, wrap=wrap)
 
 
-def consistency(guidance: Array, model: str | os.PathLike[str], *, scale: float) -> float:
+def consistency(
+    guidance: str | os.PathLike[str] | Array, model: str | os.PathLike[str], *, scale: float
+) -> float:
     """How alike R(A(G)) shrunk and R(A(G shrunk)) are: PSNR in decibel over nine pairs.
 
     Args:
-        guidance: (h, w, c) linear image.
+        guidance: an image file, or (h, w, c) linear values; of large ones the middle is taken.
         model: a NeuBTF file with its encoder.
         scale: below 1.
     """
     from btfkit import directions, metrics
     from btfkit.materials.evaluation import texel_centres
 
-    fine = propagate(guidance, model)
-    coarse = propagate(guidance, model, scale=scale)
+    image = _middle(_image(guidance)[0])
+    fine = propagate(image, model)
+    coarse = propagate(image, model, scale=scale)
     table = directions.bonn81()[[0, 20, 40]]
     total = 0.0
     for light in table:
@@ -183,6 +187,13 @@ def consistency(guidance: Array, model: str | os.PathLike[str], *, scale: float)
             )[0].permute(1, 2, 0)
             total += float(np.square(shrunk.numpy() - answers[1]).mean())
     return metrics.psnr(total / len(table) ** 2)
+
+
+def _middle(image: Array) -> Array:
+    """The central part of an image, at most 256 texels a side: enough to compare scales on."""
+    h, w = image.shape[:2]
+    top, left = max(h - _COMPARED, 0) // 2, max(w - _COMPARED, 0) // 2
+    return image[top : top + _COMPARED, left : left + _COMPARED]
 
 
 def _fitted(

@@ -22,6 +22,7 @@ from btfkit.errors import FitError, FormatError
 from btfkit.fitting import augment, fit, guides, loop, losses, neubtf, neubtf_data, siren
 from btfkit.fitting.siren import Renderer
 from btfkit.fitting.unet import STRIDE, Encoder
+from btfkit.io import images
 from btfkit.materials.neubtf import NeuBTFSpec, on_disc, renderer_shapes
 from btfkit.relief.synth import synth_btf
 
@@ -417,6 +418,22 @@ def test_a_propagated_model_needs_no_encoder_and_cannot_be_propagated_again(
     assert not propagation.has_encoder(out)
     with pytest.raises(FitError, match="has no encoder"):
         propagation.propagate(guidance, out)
+
+
+def test_the_verb_says_how_alike_a_rescaled_material_is(
+    fitted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from btfkit.cli import btfkit as group
+    from btfkit.cli.outcome import run
+
+    ramp = np.linspace(20, 235, 40).astype(np.uint8)
+    _png(tmp_path / "g.png", np.broadcast_to(ramp[:, None], (300, 40, 3)).copy())
+    line = ["propagate", tmp_path / "g.png", "--model", fitted, "-o", tmp_path / "p.safetensors"]
+    assert run(group, [*map(str, line), "--scale", "0.5", "--json"]) == 0
+    data = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert data["grid"] == [150, 20]
+    middle = images.read("g.png", (tmp_path / "g.png").read_bytes(), transfer="srgb")[22:278]
+    assert data["consistency_db"] == propagation.consistency(middle, fitted, scale=0.5)
 
 
 def test_scale_resizes_the_guidance_and_the_texel(fitted: Path) -> None:

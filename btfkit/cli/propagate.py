@@ -34,7 +34,7 @@ def propagate_verb(
 
     Without --model, the only NeuBTF with an encoder in this folder is taken.
     """
-    from btfkit.propagation import has_encoder, propagate
+    from btfkit.propagation import consistency, has_encoder, propagate
 
     source = model or the_only(
         (path for path in Path().glob("*.safetensors") if has_encoder(path)),
@@ -46,7 +46,9 @@ def propagate_verb(
         guidance, source, scale=scale, tileable=tileable, out=final, force=force, progress=bar
     )
     h, w = material.header.grid
-    return Outcome(
-        f"{final}: {source.name} on {guidance.name}, {h} x {w} texels",
-        {"out": final, "model": source, "grid": (h, w), **material.header.provenance},
-    )
+    line = f"{final}: {source.name} on {guidance.name}, {h} x {w} texels"
+    found = {"out": final, "model": source, "grid": (h, w), **material.header.provenance}
+    if scale < 1:
+        found["consistency_db"] = alike = consistency(guidance, source, scale=scale)
+        line += f"; {alike:.1f} dB from the material at full size, shrunk"
+    return Outcome(line, found)
