@@ -103,7 +103,7 @@ def test_the_verb_prints_one_json_object(tmp_path, capsys):
     assert code == 0
     found = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert found["cells"][0]["model"] == "lambert"
-    assert found["machine"]["cores"] >= 1
+    assert found["machine"]["threads"] >= 1
     assert len(found["files"]) == 4
     assert run_cli(btfkit, ["bench", "jelly", "-o", str(tmp_path / "c")]) == 1
     assert "neither a file nor a material" in capsys.readouterr().err

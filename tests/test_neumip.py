@@ -298,6 +298,16 @@ def test_fits_a_btf_better_than_its_mean(model, tmp_path):
     np.testing.assert_allclose(loaded.evaluate(*ask).reflectance, mean, atol=bound)
 
 
+def test_every_level_of_a_smaller_texture_is_trained():
+    model = trainable.NeuMIP(bumps(), np.arange(60), np.arange(0), generators=loop.Generators(0),
+                             settings={"size": "4", "batch": "1024"})  # fmt: skip
+    for step in range(3):
+        model.step(step / 3)
+    moments = model.layout.textures(model._arrays["texels.second"])
+    for levels in moments:
+        assert all(texture[..., :7].any(axis=-1).all() for texture in levels)
+
+
 def rows(count=4000, *, footprint=True, seed=0):
     rng = np.random.default_rng(seed)
     uv, light, view = rng.random((count, 2), np.float32), upper(rng, count), upper(rng, count)

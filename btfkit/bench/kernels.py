@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from btfkit import metrics
 from btfkit.bench.cells import peak
 from btfkit.btf import BTF
 from btfkit.fitting.neumip import NeuMIP, initial_texels, initial_weights
@@ -144,13 +145,13 @@ def precision_table(material: evaluated.NeuMIP, asked: Asked) -> list[dict[str, 
     for precision in precisions:
         stored = evaluated.in_precision(first, precision)
         error = stored.evaluate(*asked[:3], blur).reflectance - truth
-        mse = float(np.square(error).mean())
+        mse = float(np.square(error, dtype=np.float64).mean())
         rows.append(
             {
                 "precision": precision,
                 "bytes": int(sum(a.nbytes for a in stored.weights.values())),
                 "mae": float(np.abs(error).mean()),
-                "psnr": -10 * float(np.log10(max(mse, 1e-20))),
+                "psnr": metrics.psnr(mse),
             }
         )
     return rows

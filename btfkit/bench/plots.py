@@ -61,7 +61,9 @@ def _draw(
             points = sorted((float(r[x]), float(r["psnr_log1p"])) for r in group)
             index = models.index(model)
             style = {"color": f"C{index}", "marker": marks[index % len(marks)]}
-            line = "-" if len(points) > 1 else ""
+            # Sizes of a closed form are no course in time.
+            timed = any(row["budget_cpu_s"] is not None for row in rows if row["model"] == model)
+            line = "-" if len(points) > 1 and (timed or not courses) else ""
             axis.plot(*zip(*points, strict=True), line, label=model, **style)
             if courses:
                 _course([r for r in here if joined(r) == model], axis, f"C{index}")

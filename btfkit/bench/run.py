@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import os
 import platform
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
@@ -108,7 +109,8 @@ def machine() -> dict[str, Any]:
     """Processor, compiler and versions that figures depend on."""
     return {
         "processor": _processor(),
-        "cores": native.threads(),
+        "cores": os.cpu_count(),
+        "threads": native.threads(),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
         "python": platform.python_version(),
         "compiler": _compiler(),

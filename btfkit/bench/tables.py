@@ -14,7 +14,8 @@ def markdown(found: Mapping[str, Any]) -> str:
     peak = machine["peak_gflops_one_thread"]
     parts = [
         "# btfkit bench\n",
-        f"{machine['processor']}, {machine['cores']} cores, {machine['system']}; "
+        f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads; "
+        f"{machine['system']}; "
         f"{machine['compiler']}; Python {machine['python']}; kernels {machine['variants']}; "
         + (f"measured peak {peak:.0f} GFLOP/s a thread.\n" if peak else "no kernels built.\n"),
     ]

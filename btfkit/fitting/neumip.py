@@ -160,7 +160,7 @@ class _Trainable(Trainable, ABC):
         self._source: Source
         if isinstance(source, BTF):
             self._source = TexelSource(
-                source, train, test, levels=self.spec.levels, seed=generators.seed,
+                source, train, test, levels=self._data_levels(), seed=generators.seed,
                 pool_bytes=s.pool_mb << 20, progress=progress,
             )  # fmt: skip
         else:
@@ -170,6 +170,13 @@ class _Trainable(Trainable, ABC):
         self._decay = s.decay * min(1.0, _DECAY_PAIRS / max(len(train), 1))
         self._steps, self._rate = 0, 1.0
         self._arrays = self._initial(generators.numpy)
+
+    def _data_levels(self) -> int:
+        """Levels of the data's own grid that the model's pyramid reaches to."""
+        if self.spec.levels == 1:
+            return 1
+        finest = math.ceil(self.layout.banks[0].shift)
+        return min(self.spec.levels + finest, most_levels(self._header.grid))
 
     @abstractmethod
     def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:
