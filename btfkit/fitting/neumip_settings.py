@@ -1,0 +1,111 @@
+"""What `--set key=value` reaches of NeuMIP."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, final
+
+from btfkit.fitting.pool import DEFAULT_BYTES
+
+
+@final
+@dataclass(frozen=True)
+class Settings:
+    """What `--set key=value` reaches. 0 leaves the choice to the data where that is said.
+
+    Attributes:
+        levels: of detail; 0: a whole pyramid for textures, as the footprints need for queries.
+        size: rows of the finest texture; 0: the data's own.
+        features, coarse, light, offset: channels, as in `NeuMIPSpec`.
+        width, offset_width: of the three hidden layers of each network.
+        activation, offset_activation: "relu", "leaky" or "sine".
+        inputs: "xy" as published, "half" with the half vector beside it, "full" with all cosines,
+            the angle between the directions and the level of detail.
+        output: "log", "relu" or "mask"; the published recipe has 3 or 6 `outputs` instead.
+        outputs: of the published recipe: 3 as in its text, 6 as in its program.
+        loss: "square" or "absolute", on log(1 + rgb).
+        batch: queries a step; 0: by the size of the texture.
+        rate, texture_rate: peak learning rates. beta2: of Adam.
+        decay: of the weights a unit of learning rate, for few direction pairs: divided by how many
+            times 60 of them there are. Queries each have a pair of their own, and next to none.
+        omega: factor on the first layers' initial weights where they end in sines.
+        smooth: texels of blur a pass while training begins; it halves nine times in a run.
+        precision: of the saved textures: float32, float16 or int8.
+        pool_mb: memory for textures.
+        wrap: of query files, which do not say it themselves.
+    """
+
+    levels: int = 0
+    size: int = 0
+    features: int = 7
+    coarse: int = 0
+    light: int = 0
+    offset: int = 7
+    width: int = 25
+    offset_width: int = 25
+    activation: str = "leaky"
+    offset_activation: str = "relu"
+    inputs: str = "full"
+    output: str = "log"
+    outputs: int = 3
+    loss: str = "square"
+    batch: int = 0
+    rate: float = 1e-2
+    texture_rate: float = 1e-2
+    beta2: float = 0.99
+    decay: float = 1.0
+    omega: float = 1.0
+    smooth: float = 0.0
+    precision: str = "float16"
+    pool_mb: int = DEFAULT_BYTES >> 20
+    wrap: str = "wrap"
+
+    @staticmethod
+    def of(given: Mapping[str, str], model: str) -> Settings:
+        """Settings from text; ValueError lists the names there are."""
+        kinds: dict[str, Any] = {f.name: type(f.default) for f in fields(Settings)}
+        unknown = sorted(given.keys() - kinds.keys())
+        if unknown:
+            raise ValueError(
+                f"{model} has no setting {', '.join(unknown)}; it has {', '.join(kinds)}"
+            )
+        values: dict[str, Any] = {}
+        for name, text in given.items():
+            try:
+                values[name] = kinds[name](text)
+            except ValueError as error:
+                kind = {"int": "a whole number", "float": "a number"}[kinds[name].__name__]
+                raise ValueError(f"{name} = {text!r}; expected {kind}") from error
+        return Settings(**values)
+
+    def __post_init__(self) -> None:
+        choices = {
+            "activation": ("relu", "leaky", "sine"),
+            "offset_activation": ("relu", "leaky", "sine"),
+            "inputs": tuple(INPUTS),
+            "output": ("log", "relu", "mask"),
+            "outputs": (3, 6),
+            "loss": ("square", "absolute"),
+            "precision": ("float32", "float16", "int8"),
+            "wrap": ("wrap", "clamp"),
+        }
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                known = ", ".join(map(str, allowed))
+                raise ValueError(f"{name} = {getattr(self, name)!r}; expected one of {known}")
+        for name, low, high in (
+            ("levels", 0, 16), ("size", 0, 1 << 14), ("features", 1, 8), ("coarse", 0, 8),
+            ("light", 0, 8), ("offset", 0, 8), ("width", 1, 128), ("offset_width", 1, 128),
+            ("batch", 0, 1 << 24), ("pool_mb", 1, 1 << 24), ("rate", 0, 1), ("texture_rate", 0, 1),
+            ("beta2", 0, 0.999999), ("decay", 0, 100), ("omega", 0, 1000), ("smooth", 0, 1),
+        ):  # fmt: skip
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name} = {getattr(self, name)}; expected {low} to {high}")
+
+
+INPUTS: dict[str, tuple[str, ...]] = {
+    "xy": ("lx", "ly", "vx", "vy"),
+    "half": ("lx", "ly", "vx", "vy", "hx", "hy"),
+    "full": ("lx", "ly", "lz", "vx", "vy", "vz", "hx", "hy", "hz", "cos_diff", "level"),
+}
