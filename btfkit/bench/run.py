@@ -51,7 +51,7 @@ class Profile:
 
 
 QUICK = Profile(
-    materials=("cobbles", "print"), budgets_cpu_s=(1.0, 3.0), size=48, directions=12,
+    materials=("cobbles", "print"), budgets_cpu_s=(0.5, 1.5), size=48, directions=12,
     kernel_seconds=0.1,
 )  # fmt: skip
 
