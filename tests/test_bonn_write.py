@@ -17,6 +17,7 @@ from btfkit.cli import btfkit as verbs
 from btfkit.cli.outcome import run
 from btfkit.io import bonn_rows, bonn_write
 from btfkit.io.bonn_sketch import Sketch
+from btfkit.relief.synth import synth_btf
 from btfkit.textures import Array, Textures
 
 
@@ -64,7 +65,7 @@ def rms(difference: np.ndarray) -> float:
 @pytest.mark.parametrize("rank", [1, 5, 40])
 def test_no_factorisation_of_that_rank_is_closer(tmp_path: Path, rank: int) -> None:
     btf = made()
-    written = bonn_write.write(btf, tmp_path / "a.btf", rank=rank, scalar=4)
+    written = bonn_write.write(btf, tmp_path / "a.btf", rank=rank, scalar=4, drr=True)
     back = btfkit.open(tmp_path / "a.btf")
     wanted = logs(in_file_order(btf, back))
     found = logs(images(back))
@@ -83,12 +84,26 @@ def test_no_factorisation_of_that_rank_is_closer(tmp_path: Path, rank: int) -> N
     assert back.provenance["dynamic_range_reduction"] is True
 
 
+def test_hard_shadows_survive_the_defaults(tmp_path: Path) -> None:
+    btf = synth_btf("cobbles", size=24, lights="13", views="9", samples=2)
+    errors = {}
+    for drr in (False, True):
+        bonn_write.write(btf, tmp_path / "a.btf", rank=24, drr=drr, force=True)
+        back = btfkit.open(tmp_path / "a.btf")
+        errors[drr] = rms(images(back) - in_file_order(btf, back))
+    # A shadow's logarithm is -11.5: it owns the components, and light comes back wrong.
+    assert errors[False] < 0.3 * errors[True]
+    bonn_write.write(btf, tmp_path / "a.btf", rank=24, force=True)
+    back = btfkit.open(tmp_path / "a.btf")
+    assert rms(images(back) - in_file_order(btf, back)) == errors[False]
+
+
 @pytest.mark.parametrize("error", [0.3, 0.06, 0.03, 1e-3])
 def test_an_error_is_met_with_no_more_components_than_it_takes(
     tmp_path: Path, error: float
 ) -> None:
     btf = made()
-    written = bonn_write.write(btf, tmp_path / "a.btf", error=error, scalar=4)
+    written = bonn_write.write(btf, tmp_path / "a.btf", error=error, scalar=4, drr=True)
     back = btfkit.open(tmp_path / "a.btf")
     wanted = logs(in_file_order(btf, back))
     assert rms(logs(images(back)) - wanted) <= error * 1.001
@@ -173,7 +188,7 @@ def test_negative_values_are_counted_where_logarithms_lose_them(tmp_path: Path) 
     values[2, 1, 1] = -0.25
     below = BTF(textures=values, light=btf.light, view=btf.view)
     with pytest.warns(UserWarning, match="3 negative values were written as 0"):
-        bonn_write.write(below, tmp_path / "a.btf", scalar=4)
+        bonn_write.write(below, tmp_path / "a.btf", scalar=4, drr=True)
     back = btfkit.open(tmp_path / "a.btf")
     expected = np.maximum(in_file_order(below, back), 0)
     np.testing.assert_allclose(images(back), expected, atol=1e-5)

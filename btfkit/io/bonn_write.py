@@ -47,8 +47,8 @@ def write(
     rank: int | None = None,
     error: float | None = None,
     scalar: int = 2,
-    drr: bool = True,
-    colour_model: str | int = "Ylog_UdivY_VdivY",
+    drr: bool = False,
+    colour_model: str | int = "YUV",
     seed: int = 0,
     force: bool = False,
     progress: Progress | None = None,
@@ -65,7 +65,8 @@ def write(
         error: keep as many components as bring the root mean square error of the factorised
             numbers (logarithms with `drr`) down to this, 1024 at most.
         scalar: bytes a number: 2, 4 or 8.
-        drr: for fmf, whether logarithms are factorised; negative values then become 0.
+        drr: for fmf, whether logarithms are factorised: errors are then relative, hard shadows
+            take most components, and negative values become 0.
         colour_model: for dfmf, a name or code of `bonn_colour.NAMES`.
         seed: of the first guess of the singular vectors.
         force: whether an existing file is replaced.
