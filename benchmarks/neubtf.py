@@ -133,7 +133,7 @@ def scales(btf: BTF, model: Path) -> dict[str, Any]:
 def propagation(cells: Cells, name: str, budget: float) -> None:
     """A 512 x 512 material: fit a 128 x 128 crop, propagate onto the frontal slice of the whole."""
     relief = procedural.make(name, 512, relief_texels=1.5)
-    table = direction_set("25")
+    table = direction_set("16")
     light, view = np.tile(table, (len(table), 1)), np.repeat(table, len(table), axis=0)
     whole = traced_btf(relief, light, view)
     crop = whole.crop(slice(0, 128), slice(0, 128))
