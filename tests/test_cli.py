@@ -189,7 +189,9 @@ def test_fit_without_a_source_lists_the_stores_and_how_to_name_one(
 def test_interruption_exits_130_and_keeps_what_was_finished(tmp_path: Path) -> None:
     script = textwrap.dedent(
         """
-        import sys, time, numpy as np
+        import signal, sys, time, numpy as np
+        # Whoever runs the tests in the background has it ignored, and passes that on.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         from btfkit import io
         from btfkit.btf import BTF
         from btfkit.cli import main
