@@ -552,7 +552,7 @@ def test_the_logarithm_is_undone_for_any_sign(value: float, floor: float) -> Non
         ({"layout": "none"}, "layout = 'none'; expected joint or channels"),
         ({"domain": "sqrt"}, "domain = 'sqrt'; expected log or linear"),
         ({"passes": "0"}, "passes and memory_mb must be positive"),
-        ({"rank": "many"}, "rank = 'many'; expected a number"),
+        ({"rank": "many"}, "rank = 'many'; expected a whole number"),
     ],
 )
 def test_settings_of_pca_are_checked(settings: dict[str, str], message: str) -> None:

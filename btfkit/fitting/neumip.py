@@ -22,6 +22,7 @@ from btfkit.fitting import neumip_torch
 from btfkit.fitting.loop import Generators, Trainable
 from btfkit.fitting.neumip_data import Batch, RowSource, Source, TexelSource, gaussian
 from btfkit.fitting.neumip_settings import INPUTS, Settings
+from btfkit.fitting.settings import parsed
 from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Header, Material
 from btfkit.materials.neumip import NeuMIPSpec, aligned, most_levels
@@ -47,7 +48,7 @@ class _Trainable(Trainable, ABC):
         generators: Generators,
         progress: Any = None,
     ) -> None:
-        self.settings = s = Settings.of(settings, self.model)
+        self.settings = s = parsed(Settings, self.model, settings)
         self._generators = generators
         self._header = _header(source, s)
         size = _texture_size(self._header.grid, s.size)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, final
+from dataclasses import dataclass
+from typing import final
 
 from btfkit.fitting.pool import DEFAULT_BYTES
 
@@ -60,24 +59,6 @@ class Settings:
     precision: str = "float16"
     pool_mb: int = DEFAULT_BYTES >> 20
     wrap: str = "wrap"
-
-    @staticmethod
-    def of(given: Mapping[str, str], model: str) -> Settings:
-        """Settings from text; ValueError lists the names there are."""
-        kinds: dict[str, Any] = {f.name: type(f.default) for f in fields(Settings)}
-        unknown = sorted(given.keys() - kinds.keys())
-        if unknown:
-            raise ValueError(
-                f"{model} has no setting {', '.join(unknown)}; it has {', '.join(kinds)}"
-            )
-        values: dict[str, Any] = {}
-        for name, text in given.items():
-            try:
-                values[name] = kinds[name](text)
-            except ValueError as error:
-                kind = {"int": "a whole number", "float": "a number"}[kinds[name].__name__]
-                raise ValueError(f"{name} = {text!r}; expected {kind}") from error
-        return Settings(**values)
 
     def __post_init__(self) -> None:
         choices = {

@@ -38,4 +38,5 @@ def _value(name: str, default: Any, text: str) -> Any:
     try:
         return number(text)
     except ValueError as error:
-        raise ValueError(f"{name} = {text!r}; expected a number") from error
+        kind = "a whole number" if number is int else "a number"
+        raise ValueError(f"{name} = {text!r}; expected {kind}") from error
