@@ -570,6 +570,14 @@ def test_an_empty_file_says_so(opened) -> None:
         opened(b"")
 
 
+def test_a_signalling_nan_in_the_directions_is_refused(opened) -> None:
+    raw = bytearray(SAMPLES["sparse"])
+    at = raw.index(struct.pack("<ff", 0.2, 0.3))
+    raw[at + 4 : at + 8] = struct.pack("<I", 0x7F9A999A)
+    with pytest.raises(FormatError, match="phi nan; expected radians"):
+        opened(bytes(raw))
+
+
 @pytest.mark.parametrize("kind", SAMPLES)
 @settings(max_examples=60)
 @given(data=st.data())

@@ -210,7 +210,9 @@ def read_directions(cursor: Cursor) -> Directions:
 
 
 def _angles(cursor: Cursor, found: NDArray[np.float32], what: str) -> NDArray[np.float64]:
-    angles = found.astype(np.float64)
+    # A signalling NaN complains when it is widened; it is refused below.
+    with np.errstate(invalid="ignore"):
+        angles = found.astype(np.float64)
     theta = angles[..., 0]
     # NaN compares as false.
     good = np.isfinite(angles[..., 1]) & (theta >= 0) & (theta <= np.pi / 2 + _BELOW_HORIZON)

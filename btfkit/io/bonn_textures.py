@@ -233,7 +233,9 @@ class ViewTextures(BonnTextures):
         channels = self.shape[3]
         table: NDArray[Any] = np.asarray(factors.mean)
         at = lights if factors.left_channels == channels else texels
-        return table.reshape(-1, channels)[at].astype(np.float32)
+        # What float32 cannot hold becomes NaN or infinite, and is masked like other such values.
+        with np.errstate(invalid="ignore", over="ignore"):
+            return table.reshape(-1, channels)[at].astype(np.float32)
 
 
 @final
