@@ -12,7 +12,7 @@ import torch
 from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import FitError
-from btfkit.fitting import loop, neumip_data
+from btfkit.fitting import loop, neumip_data, neumip_paper
 from btfkit.fitting import neumip as trainable
 from btfkit.fitting.fit import fit
 from btfkit.materials import file
@@ -473,7 +473,7 @@ def test_every_setting_at_its_extremes_stays_finite(settings):
 
 @pytest.mark.parametrize("outputs", ["3", "6"])
 def test_the_published_recipe_blurs_its_textures_nine_times_less(outputs):
-    model = trainable.NeuMIPPaper(bumps(), np.arange(60), np.arange(0),
+    model = neumip_paper.NeuMIPPaper(bumps(), np.arange(60), np.arange(0),
                                   generators=loop.Generators(0), settings={"outputs": outputs})  # fmt: skip
     spread = []
     for progress in (0.0, 0.5, 0.999):

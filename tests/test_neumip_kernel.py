@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from btfkit.fitting import neumip_torch
-from btfkit.fitting.neumip import adam_plain
+from btfkit.fitting.adam import adam_plain
 from btfkit.materials.neumip import aligned
 from btfkit.native import neumip as native
 from btfkit.native.neumip import Draw, Images, Kernel, Layout, Network, Pyramid

@@ -15,7 +15,8 @@ import numpy as np
 from btfkit import metrics
 from btfkit.bench.cells import peak
 from btfkit.btf import BTF
-from btfkit.fitting.neumip import NeuMIP, initial_texels, initial_weights
+from btfkit.fitting.neumip import NeuMIP
+from btfkit.fitting.neumip_start import initial_texels, initial_weights
 from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Header
 from btfkit.materials.neumip import NeuMIPSpec, most_levels

@@ -7,7 +7,7 @@ TRAINED: dict[str, str] = {
     "rainer19": "btfkit.fitting.rainer:Rainer19",
     "rainer20": "btfkit.fitting.rainer:Rainer20",
     "neumip": "btfkit.fitting.neumip:NeuMIP",
-    "neumip-paper": "btfkit.fitting.neumip:NeuMIPPaper",
+    "neumip-paper": "btfkit.fitting.neumip_paper:NeuMIPPaper",
     "neubtf": "btfkit.fitting.neubtf:NeuBTF",
 }
 # Models with a closed form: functions (source, *, settings, progress) -> Material.
