@@ -10,7 +10,11 @@ from btfkit.fitting import neumip_torch
 from btfkit.fitting.adam import adam_plain
 from btfkit.materials.neumip import aligned
 from btfkit.native import neumip as native
-from btfkit.native.neumip import Draw, Images, Kernel, Layout, Network, Pyramid
+from btfkit.native import neumip_draw
+from btfkit.native import neumip_plain as plain
+from btfkit.native.neumip import Kernel
+from btfkit.native.neumip_draw import Draw, Images
+from btfkit.native.neumip_layout import Layout, Network, Pyramid
 
 compiled = pytest.mark.skipif(not native.available(), reason="the kernel was not built")
 VARIANTS = native.variants() or [""]
@@ -103,7 +107,7 @@ def apart_from_kinks(case, weights, texels, parts):
     """
     doubles = [None if p is None else p.astype(np.float64) for p in parts]
     uv, light, view, footprint = doubles
-    depth = native.depths_plain(case, weights.astype(float), texels.astype(float), uv, view)
+    depth = plain.depths_plain(case, weights.astype(float), texels.astype(float), uv, view)
     away = np.ones(len(uv), bool)
 
     def check(at, sizes):
@@ -114,7 +118,7 @@ def apart_from_kinks(case, weights, texels, parts):
     if case.offset:
         check(uv, case.offset[0].sizes)
     for bank in case.banks:
-        move = bank.view * native.step(view, case) - bank.light * native.step(light, case)
+        move = bank.view * plain.step(view, case) - bank.light * native.step(light, case)
         check(uv + depth[:, None] * move, bank.sizes)
     if footprint is not None:
         for bank in case.banks:
@@ -136,13 +140,13 @@ def test_kernel_answers_as_its_twin(name, variant):
     weights, texels = parameters(case, rng)
     parts = queries(case, rng)
     doubles = [None if p is None else p.astype(np.float64) for p in parts]
-    wanted = native.evaluate_plain(
+    wanted = plain.evaluate_plain(
         case, weights.astype(np.float64), texels.astype(np.float64), *doubles
     )
     found = Kernel(case, variant=variant).evaluate(weights, texels, *parts)
     # Random textures are the roughest there are: a step of 1e-7 in uv moves a lookup by 1e-5.
     assert relative(found, wanted) < 5 * REL
-    single = native.evaluate_plain(case, weights, texels, *parts)
+    single = plain.evaluate_plain(case, weights, texels, *parts)
     assert single.dtype == np.float32
     assert relative(single, wanted) < 5 * REL
 
@@ -256,8 +260,8 @@ def test_drawn_texels_are_those_of_the_twin(dtype):
     for edge in (0.0, 0.7):
         images = Images(values, phase, at.astype("f4"), at[::-1].astype("f4"), (8, 12), 2, edge, 0)
         drawn, twin = Draw.empty(3000, 3), Draw.empty(3000, 3)
-        native.draw(images, 123456789, drawn)
-        native.draw_plain(images, 123456789, twin)
+        neumip_draw.draw(images, 123456789, drawn)
+        neumip_draw.draw_plain(images, 123456789, twin)
         for name in ("uv", "light", "view", "target", "slots"):
             np.testing.assert_allclose(getattr(drawn, name), getattr(twin, name), rtol=1e-5)
         assert set(drawn.slots) == set(range(5))
@@ -291,7 +295,7 @@ def test_group_11_levels_at_and_beyond_both_ends():
         blur = np.array([footprint], np.float32)
         answer = kernel.evaluate(weights, texels, uv, up, up, blur)
         np.testing.assert_allclose(
-            answer, native.evaluate_plain(case, weights, texels, uv, up, up, blur), rtol=1e-4
+            answer, plain.evaluate_plain(case, weights, texels, uv, up, up, blur), rtol=1e-4
         )
         return answer
 
@@ -320,7 +324,7 @@ def test_group_12_any_size(size, wrap):
     parts = queries(case, rng, 300)
     found = Kernel(case).evaluate(weights, texels, *parts)
     doubles = [p.astype(np.float64) for p in (weights, texels, *parts)]
-    assert relative(found, native.evaluate_plain(case, *doubles)) < 1e-4
+    assert relative(found, plain.evaluate_plain(case, *doubles)) < 1e-4
 
 
 @compiled

@@ -20,7 +20,8 @@ from btfkit.fitting.neumip_start import initial_texels, initial_weights
 from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Header
 from btfkit.materials.neumip import NeuMIPSpec, most_levels
-from btfkit.native.neumip import Activation, Array, Kernel, Layout, variants
+from btfkit.native.neumip import Kernel, variants
+from btfkit.native.neumip_layout import Activation, Array, Layout
 from btfkit.textures import as_textures
 
 _SECONDS = 0.5

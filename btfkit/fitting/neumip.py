@@ -21,7 +21,8 @@ from btfkit.fitting.neumip_start import initial_texels, initial_weights
 from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Material
 from btfkit.materials.neumip import NeuMIPSpec, aligned
-from btfkit.native.neumip import Array, Kernel, available
+from btfkit.native.neumip import Kernel, available
+from btfkit.native.neumip_layout import Array
 
 
 @final

@@ -16,7 +16,8 @@ from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.pool import Pool
-from btfkit.native.neumip import Array, Draw, Images, draw
+from btfkit.native.neumip_draw import Draw, Images, draw
+from btfkit.native.neumip_layout import Array
 from btfkit.queries import QuerySet
 
 Progress = Callable[[int, int], None]

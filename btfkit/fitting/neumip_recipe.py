@@ -22,7 +22,7 @@ from btfkit.fitting.settings import parsed
 from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Header, Material
 from btfkit.materials.neumip import NeuMIPSpec, most_levels
-from btfkit.native.neumip import Array, Layout
+from btfkit.native.neumip_layout import Array, Layout
 from btfkit.queries import QuerySet
 
 # Direction pairs for which a decay of 1 is right; docs/neumip.md has the measurements.

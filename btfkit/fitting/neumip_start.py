@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from btfkit.materials.neumip import aligned
-from btfkit.native.neumip import Array, Layout, Network
+from btfkit.native.neumip_layout import Array, Layout, Network
 
 
 def initial_weights(network: Network, flat: Array, rng: np.random.Generator, omega: float) -> None:

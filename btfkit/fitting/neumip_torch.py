@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from btfkit.native.neumip import DIRECTIONS, LEAK, Layout, Network, Pyramid
+from btfkit.native.neumip_layout import DIRECTIONS, LEAK, Layout, Network, Pyramid
+from btfkit.native.neumip_plain import FLATTEST, MARCH, STEEPEST
 
 
 def forward(
@@ -34,11 +35,58 @@ def forward(
         pyramid, network = layout.offset
         psi = bilinear(textures.pop(0)[0], uv, wrap=layout.wrap)[:, : pyramid.channels]
         depth = run(network, offset_weights, [psi], known) * layout.depth_scale
+    elif layout.heights is not None:
+        depth = ray_depth(layout, layout.surface(texels), uv, view)
     features = []
     for bank, levels in zip(layout.banks, textures, strict=True):
         move = bank.view * step(view, layout) - bank.light * step(light, layout)
         features.append(_between_levels(bank, levels, uv + depth * move, known, wrap=layout.wrap))
     return run(layout.decoder, decoder_weights, features, known)
+
+
+def ray_depth(layout: Layout, surface: Tensor, uv: Tensor, view: Tensor) -> Tensor:
+    """Depth (b, 1) where view rays meet heights (h, w), tile widths; differentiable in these.
+
+    By the implicit function theorem a height moves the crossing by 1 / (1 - slope along the ray);
+    where a ray grazes, by no more than 1 / FLATTEST.
+    """
+    upward = view[:, 2:].clamp(min=STEEPEST)
+    along = view[:, :2] / upward * view.new_tensor([1.0, -layout.aspect]) * layout.depth_scale
+    with torch.no_grad():
+        t = _crossing(surface, uv, along, wrap=layout.wrap)[:, None]
+        here = (uv + t * along).requires_grad_()
+    with torch.enable_grad():
+        height = bilinear(surface.detach()[..., None], here, wrap=layout.wrap)
+        (slope,) = torch.autograd.grad(height.sum(), here)
+    clear = (1 - (slope * along).sum(1, keepdim=True)).clamp(min=FLATTEST)
+    height = bilinear(surface[..., None], here.detach(), wrap=layout.wrap)
+    t = t + (height - height.detach()) / clear
+    return t * view[:, 2:].clamp(min=0.6) / upward * layout.depth_scale
+
+
+def _crossing(surface: Tensor, uv: Tensor, along: Tensor, *, wrap: bool) -> Tensor:
+    """The twin of `neumip_plain.crossing`."""
+    h, w = surface.shape
+    top, bottom = surface.max(), surface.min()
+    texels = (along.abs() * along.new_tensor([w, h])).amax(1) * (top - bottom)
+    count = texels.ceil().clamp(1, MARCH)
+
+    def above(t: Tensor) -> Tensor:
+        return t - bilinear(surface[..., None], uv + t[:, None] * along, wrap=wrap)[:, 0]
+
+    t = top.expand(len(uv))
+    gap = above(t)
+    met = bottom.expand(len(uv))
+    going = torch.ones(len(uv), dtype=torch.bool, device=uv.device)
+    for k in range(1, MARCH + 1):
+        at = top + (bottom - top) * (k / count).clamp(max=1)
+        below = above(at)
+        here = going & (below <= 0)
+        share = gap / (gap - below).clamp(min=1e-12)
+        met = torch.where(here, t + (at - t) * share, met)
+        going = going & ~here
+        t, gap = at, below
+    return met
 
 
 def log_answer(layout: Layout, raw: Tensor) -> Tensor:

@@ -15,18 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from btfkit.directions import normalize
 from btfkit.materials.base import Array, Header, Material
-from btfkit.native.neumip import (
-    CHANNELS,
-    Activation,
-    Kernel,
-    Layout,
-    Network,
-    Output,
-    Pyramid,
-    available,
-    depths_plain,
-    evaluate_plain,
-)
+from btfkit.native.neumip import Kernel, available
+from btfkit.native.neumip_layout import CHANNELS, Activation, Layout, Network, Output, Pyramid
+from btfkit.native.neumip_plain import depths_plain, evaluate_plain
 from btfkit.queries import Query
 
 Precision = Literal["float32", "float16", "int8"]
@@ -45,13 +36,15 @@ class NeuMIPSpec:
         features: channels of the pyramid, 1 to 8.
         coarse: channels of a second pyramid that begins two levels up; 0 for none.
         light: channels of a texture that is read where the light comes in; 0 for none.
-        offset: channels of the offset texture, 1 to 8; 0 for no offset stage.
+        offset: channels of the offset texture, 1 to 8; 0 for no offset network.
+        heights: whether the ray depth is where the view ray meets a texture of heights; then
+            there is no offset network, whatever `offset` says.
         hidden, offset_hidden: widths of the hidden layers.
         activation, offset_activation: of the hidden layers.
         directions: what the decoder takes beside the features.
         output: "log", "relu" or "mask" as in `Layout`; "released" for the six numbers of the
             published program: exp(YUV to RGB) - 1, times 0.1 + sigmoid.
-        depth_scale: tile widths a unit of the offset network.
+        depth_scale: tile widths a unit of the offset network, or of the heights.
         channels: of the answer.
         precision: of the stored textures.
     """
@@ -71,6 +64,7 @@ class NeuMIPSpec:
     depth_scale: float = 0.05
     channels: int = 3
     precision: Precision = "float32"
+    heights: bool = False
 
     def layout(self, header: Header) -> Layout:
         """The model as its kernels see it."""
@@ -87,7 +81,7 @@ class NeuMIPSpec:
         inputs = sum(bank.channels for bank in banks) + len(self.directions)
         decoder = Network((inputs, *self.hidden, outputs), self.directions, self.activation)
         offset = None
-        if self.offset:
+        if self.offset and not self.heights:
             widths = (self.offset + 2, *self.offset_hidden, 1)
             network = Network(widths, ("vx", "vy"), self.offset_activation)
             offset = (Pyramid((self.size,), self.offset), network)
@@ -98,6 +92,7 @@ class NeuMIPSpec:
             decoder,
             tuple(banks),
             offset,
+            self.size if self.heights else None,
             channels=outputs if released else self.channels,
             output=output,
             aspect=header.aspect,
@@ -127,6 +122,8 @@ class _NeuMIP(Material):
         self.layout = spec.layout(header)
         self.flat, self.texels = flatten(spec, self.layout, self.weights)
         self._kernel = Kernel(self.layout) if available() else None
+        if self._kernel:
+            self._kernel.freeze(self.texels)
 
     @classmethod
     def shapes(cls, spec: NeuMIPSpec, header: Header) -> dict[str, tuple[int, ...]]:
@@ -239,8 +236,7 @@ def flatten(
         ]
     )
     texels = aligned(layout.texels)
-    views = [texture for levels in layout.textures(texels) for texture in levels]
-    for view, (name, _, channels) in zip(views, _textures(layout), strict=True):
+    for view, (name, _, channels) in zip(_views(layout, texels), _textures(layout), strict=True):
         stored = weights[name]
         if spec.precision == "int8":
             low, step = np.asarray(weights[f"{name}.range"], np.float32)
@@ -258,8 +254,7 @@ def name_arrays(
     for (name, network), part in zip(_networks(layout), parts, strict=True):
         for k, (matrix, bias) in enumerate(network.layers(part)):
             found[f"{name}.{k}.weight"], found[f"{name}.{k}.bias"] = matrix.copy(), bias.copy()
-    views = [texture for levels in layout.textures(texels) for texture in levels]
-    for view, (name, _, channels) in zip(views, _textures(layout), strict=True):
+    for view, (name, _, channels) in zip(_views(layout, texels), _textures(layout), strict=True):
         texture = view[..., :channels]
         if spec.precision == "int8":
             low = texture.min(axis=(0, 1))
@@ -294,11 +289,19 @@ def _networks(layout: Layout) -> list[tuple[str, Network]]:
 
 def _textures(layout: Layout) -> list[tuple[str, tuple[int, int], int]]:
     found = []
+    if layout.heights:
+        found.append(("texture.heights", layout.heights, 1))
     if layout.offset:
         found.append(("texture.offset", layout.offset[0].sizes[0], layout.offset[0].channels))
     for b, bank in enumerate(layout.banks):
         found += [(f"texture.{b}.{s}", size, bank.channels) for s, size in enumerate(bank.sizes)]
     return found
+
+
+def _views(layout: Layout, texels: Array) -> list[Array]:
+    """A view of each texture that `_textures` lists."""
+    heights = [layout.surface(texels)[..., None]] if layout.heights else []
+    return heights + [texture for levels in layout.textures(texels) for texture in levels]
 
 
 def _level_of(size: tuple[int, int], grid: tuple[int, int]) -> float:

@@ -34,6 +34,8 @@
 #define NEUMIP_LANES 8
 #define NEUMIP_TARGET __attribute__((target("avx2,fma")))
 #include "neumip_kernel.hpp"
+#include "neumip_lookup.hpp"
+#include "neumip_march.hpp"
 #include "neumip_tile.hpp"
 #undef NEUMIP_SPACE
 #undef NEUMIP_LANES
@@ -43,6 +45,8 @@
 #define NEUMIP_TARGET \
     __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx2,fma,prefer-vector-width=512")))
 #include "neumip_kernel.hpp"
+#include "neumip_lookup.hpp"
+#include "neumip_march.hpp"
 #include "neumip_tile.hpp"
 #undef NEUMIP_SPACE
 #undef NEUMIP_LANES
@@ -56,6 +60,8 @@
 #define NEUMIP_LANES 4
 #define NEUMIP_TARGET
 #include "neumip_kernel.hpp"
+#include "neumip_lookup.hpp"
+#include "neumip_march.hpp"
 #include "neumip_tile.hpp"
 
 namespace nb = nanobind;
@@ -152,6 +158,7 @@ class Model {
     Model(bool wrap, float aspect, float depth_scale, int output, int channels,
           const std::vector<std::vector<int64_t>>& textures,
           const std::vector<std::vector<double>>& banks, bool offset,
+          const std::vector<int>& heights,
           const std::vector<int>& offset_widths, const std::vector<int>& offset_directions,
           int offset_activation, const std::vector<int>& widths,
           const std::vector<int>& directions, int activation) {
@@ -173,6 +180,10 @@ class Model {
             else p.banks.push_back(bank);
         }
         p.offset = offset;
+        if (!heights.empty()) {
+            require(heights.size() == 2 && heights[0] > 0 && heights[1] > 0, "heights are (h, w)");
+            p.heights = {heights[0], heights[1], 0};
+        }
         if (offset) {
             p.offset_mlp.widths = offset_widths;
             p.offset_mlp.directions = offset_directions;
@@ -187,6 +198,17 @@ class Model {
 
     Model(const Model&) = delete;
     Model& operator=(const Model&) = delete;
+
+    // Promises that the texels stay as they are: their range is not looked up again.
+    void freeze(In<float> t) {
+        require(int64_t(t.size()) == texels() * kChannels, "size of the texels");
+        frozen_ = false;
+        Batch b;
+        range(t.data(), b);
+        top_ = b.top;
+        bottom_ = b.bottom;
+        frozen_ = true;
+    }
 
     int64_t weights() const { return int64_t(plan_.weights()); }
     int64_t texels() const { return plan_.texels(); }
@@ -312,8 +334,26 @@ class Model {
         require(int64_t(view.size()) == 3 * b.size, "one view a query");
         b.uv = uv.data();
         b.view = view.data();
+        range(t.data(), b);
         if (!footprint.is_none()) b.footprint = floats(footprint, b.size, "one footprint a query");
         return b;
+    }
+    // Highest and lowest height: of texels that were frozen, those found then.
+    void range(const float* heights, Batch& b) const {
+        const int64_t count = int64_t(plan_.heights.h) * plan_.heights.w;
+        if (count == 0) return;
+        if (frozen_) {
+            b.top = top_;
+            b.bottom = bottom_;
+            return;
+        }
+        float top = -INFINITY, bottom = INFINITY;
+        for (int64_t i = 0; i < count; ++i) {
+            top = heights[i] > top ? heights[i] : top;
+            bottom = heights[i] < bottom ? heights[i] : bottom;
+        }
+        b.top = top >= bottom ? top : 0.f;
+        b.bottom = top >= bottom ? bottom : 0.f;
     }
     void grow(int threads) {
         while (int(weights_.size()) < threads) {
@@ -324,6 +364,8 @@ class Model {
     }
 
     Plan plan_;
+    bool frozen_ = false;
+    float top_ = 0, bottom_ = 0;
     std::vector<std::vector<float>> weights_;
     std::vector<Zeros> texels_;
     std::vector<std::vector<uint8_t>> touched_;
@@ -416,12 +458,13 @@ NB_MODULE(_neumip, m) {
     nb::class_<Model>(m, "Model")
         .def(nb::init<bool, float, float, int, int, const std::vector<std::vector<int64_t>>&,
                       const std::vector<std::vector<double>>&, bool, const std::vector<int>&,
-                      const std::vector<int>&, int, const std::vector<int>&,
+                      const std::vector<int>&, const std::vector<int>&, int, const std::vector<int>&,
                       const std::vector<int>&, int>())
         .def_prop_ro("weights", &Model::weights)
         .def_prop_ro("texels", &Model::texels)
         .def("evaluate", &Model::evaluate, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
              nb::arg().none(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg())
+        .def("freeze", &Model::freeze)
         .def("depths", &Model::depths)
         .def("train", &Model::train, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
              nb::arg().none(), nb::arg(), nb::arg().none(), nb::arg(), nb::arg(), nb::arg())

@@ -53,15 +53,17 @@ struct Plan {
     int output = kLog, channels = 3;
     std::vector<Texture> textures;
     Bank offset_bank{};
+    Texture heights{0, 0, 0};  // one float a texel, first of all; h = 0 where there are none
     std::vector<Bank> banks;
     Mlp offset_mlp, decoder;
 
     size_t weights() const { return (offset ? offset_mlp.size() : 0) + decoder.size(); }
     int64_t texels() const {
-        int64_t n = 0;
+        int64_t n = (int64_t(heights.h) * heights.w + kChannels - 1) / kChannels;
         for (const auto& t : textures) n = std::max(n, t.start + int64_t(t.h) * t.w);
         return n;
     }
+    bool depth() const { return offset || heights.h > 0; }
     bool needs_light() const {
         for (const auto& b : banks)
             if (b.light != 0) return true;
@@ -95,6 +97,8 @@ inline void check(const Plan& plan) {
                     size_t(b.first + b.count) <= plan.textures.size(),
                 "a bank has 1 to 16 levels");
     };
+    require(!(plan.offset && plan.heights.h), "depths from a network or from heights, not both");
+    require(int64_t(plan.heights.h) * plan.heights.w < (int64_t(1) << 30), "2^30 heights or more");
     int features = 0;
     for (const auto& b : plan.banks) {
         bank(b);
@@ -120,6 +124,7 @@ struct Batch {
     int64_t size = 0;
     const float *uv = nullptr, *light = nullptr, *view = nullptr, *footprint = nullptr;
     const float *target = nullptr, *weight = nullptr;
+    float top = 0, bottom = 0;  // of the heights
 };
 
 struct Gradient {

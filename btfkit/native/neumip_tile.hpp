@@ -1,192 +1,4 @@
-// One tile of queries through the model and back: included after neumip_kernel.hpp, once a variant.
-
-// ---------------------------------------------------------------- texture lookups
-
-// Fractions and texels from u, v in tiles and per-query texture sizes (floats) and starts.
-FN void corners(Lookup& k, int n, F u, F v, F w, F h, I start, bool wrap) {
-    F x, y;
-    if (wrap) {
-        x = (u - floor_of(u)) * w - 0.5f;
-        y = (v - floor_of(v)) * h - 0.5f;
-    } else {
-        x = u * w - 0.5f;
-        y = v * h - 0.5f;
-    }
-    // Whatever is no number becomes a border here: no index leaves the texture.
-    x = smaller(larger(x, all(-1.f)), w);
-    y = smaller(larger(y, all(-1.f)), h);
-    const F x0 = floor_of(x), y0 = floor_of(y);
-    F xa = x0, xb = x0 + 1.f, ya = y0, yb = y0 + 1.f;
-    if (wrap) {
-        xa = xa < all(0.f) ? xa + w : xa;
-        ya = ya < all(0.f) ? ya + h : ya;
-        xa = xa >= w ? xa - w : xa;
-        ya = ya >= h ? ya - h : ya;
-        xb = xb >= w ? xb - w : xb;
-        yb = yb >= h ? yb - h : yb;
-        xb = xb >= w ? all(0.f) : xb;
-        yb = yb >= h ? all(0.f) : yb;
-    } else {
-        xa = smaller(larger(xa, all(0.f)), w - 1.f);
-        ya = smaller(larger(ya, all(0.f)), h - 1.f);
-        xb = smaller(larger(xb, all(0.f)), w - 1.f);
-        yb = smaller(larger(yb, all(0.f)), h - 1.f);
-    }
-    store(k.fx + n, x - x0);
-    store(k.fy + n, y - y0);
-    const I wi = __builtin_convertvector(w, I);
-    const I ra = start + __builtin_convertvector(ya, I) * wi;
-    const I rb = start + __builtin_convertvector(yb, I) * wi;
-    const I ca = __builtin_convertvector(xa, I), cb = __builtin_convertvector(xb, I);
-    *(I*)(k.at[0] + n) = ra + ca;
-    *(I*)(k.at[1] + n) = ra + cb;
-    *(I*)(k.at[2] + n) = rb + ca;
-    *(I*)(k.at[3] + n) = rb + cb;
-}
-
-DEEP void look_up_one(Lookup& k, const Texture& t, const float* u, const float* v, int first, int n,
-                      bool wrap) {
-    const F w = all(float(t.w)), h = all(float(t.h)), one = all(1.f);
-    for (int i = 0; i < n; i += L) {
-        corners(k, i, load(u + i), load(v + i), w, h, I{} + int32_t(t.start), wrap);
-        store(k.weight + i, one);
-        store(k.w + i, w);
-        store(k.h + i, h);
-    }
-    for (int i = 0; i < n; ++i) k.query[i] = first + i;
-    k.first = first;
-    k.count = n;
-}
-
-struct Levels {
-    alignas(64) float level[kTile];
-    bool finest = true;  // every query of the tile is at level 0
-};
-
-// The two levels of a bank for every query; the second list holds only those between levels.
-DEEP void look_up_levels(Lookup& a, Lookup& b, const Plan& plan, const Bank& bank,
-                         const Levels& levels, const float* u, const float* v, int first, int n,
-                         int valid) {
-    alignas(64) float w0[kTile], h0[kTile], w1[kTile], h1[kTile], f1[kTile], u1[kTile], v1[kTile];
-    alignas(64) int32_t s0[kTile], s1[kTile];
-    int second = 0;
-    const float top = float(bank.count - 1);
-    const Texture* texture = plan.textures.data() + bank.first;
-    for (int i = 0; i < n; ++i) {
-        float l = levels.level[first + i] - bank.shift;
-        l = l > 0.f ? l : 0.f;
-        l = l < top ? l : top;
-        const int at = int(l);
-        const float f = l - float(at);
-        const Texture& t0 = texture[at];
-        w0[i] = float(t0.w);
-        h0[i] = float(t0.h);
-        s0[i] = int32_t(t0.start);
-        a.weight[i] = 1.f - f;
-        a.query[i] = first + i;
-        const Texture& t1 = texture[at + (f > 0.f)];
-        w1[second] = float(t1.w);
-        h1[second] = float(t1.h);
-        s1[second] = int32_t(t1.start);
-        f1[second] = f;
-        u1[second] = u[i];
-        v1[second] = v[i];
-        b.query[second] = first + i;
-        second += f > 0.f && first + i < valid;
-    }
-    for (int i = second; i < (second + L - 1) / L * L; ++i) {
-        w1[i] = h1[i] = 1.f;
-        s1[i] = 0;
-        u1[i] = v1[i] = f1[i] = 0.f;
-    }
-    auto finish = [&](Lookup& k, int count, const float* us, const float* vs, const float* ws,
-                      const float* hs, const int32_t* starts) NEUMIP_TARGET {
-        for (int i = 0; i < count; i += L) {
-            const F w = load(ws + i), h = load(hs + i);
-            corners(k, i, load(us + i), load(vs + i), w, h, *(const I*)(starts + i), plan.wrap);
-            store(k.w + i, w);
-            store(k.h + i, h);
-        }
-    };
-    finish(a, n, u, v, w0, h0, s0);
-    a.first = first;
-    a.count = n;
-    finish(b, second, u1, v1, w1, h1, s1);
-    std::memcpy(b.weight, f1, sizeof(float) * second);
-    b.count = second;
-}
-
-// Features of one bank for a tile: values, and in training their slopes along u and v.
-struct Features {
-    alignas(64) float value[kTile][kChannels], du[kTile][kChannels], dv[kTile][kChannels];
-    Lookup list[2][2];  // first and second half of the tile; finer and coarser level
-};
-
-template <bool TRAIN, bool FIRST>
-DEEP void fetch(const Lookup& k, const float* texels, Features& out) {
-    for (int i = 0; i < k.count; ++i) {
-        const int ahead = i + kAhead < k.count ? i + kAhead : i;
-        for (int c = 0; c < 4; ++c) __builtin_prefetch(texels + size_t(k.at[c][ahead]) * kChannels);
-        const int q = FIRST ? k.first + i : k.query[i];
-        const float fx = k.fx[i], fy = k.fy[i], w = k.weight[i];
-        const V8 t00 = get8(texels + size_t(k.at[0][i]) * kChannels);
-        const V8 t01 = get8(texels + size_t(k.at[1][i]) * kChannels);
-        const V8 t10 = get8(texels + size_t(k.at[2][i]) * kChannels);
-        const V8 t11 = get8(texels + size_t(k.at[3][i]) * kChannels);
-        const V8 d0 = t01 - t00, d1 = t11 - t10;
-        const V8 a = t00 + d0 * fx, b = t10 + d1 * fx;
-        const V8 slope = b - a;
-        V8 value = (a + slope * fy) * w;
-        if (!FIRST) value += get8(out.value[q]);
-        put8(out.value[q], value);
-        if (TRAIN) {
-            V8 du = (d0 + (d1 - d0) * fy) * (w * k.w[i]), dv = slope * (w * k.h[i]);
-            if (!FIRST) {
-                du += get8(out.du[q]);
-                dv += get8(out.dv[q]);
-            }
-            put8(out.du[q], du);
-            put8(out.dv[q], dv);
-        }
-    }
-}
-
-// (kTile, 8) to rows of one channel each.
-DEEP void to_rows(const float (*from)[kChannels], float* rows, int channels, int n) {
-    for (int i = 0; i < n; i += 8) {
-        V8 r[8];
-        for (int j = 0; j < 8; ++j) r[j] = get8(from[i + j]);
-        transpose8(r);
-        for (int c = 0; c < channels; ++c) put8(rows + c * kStride + i, r[c]);
-    }
-}
-
-DEEP void from_rows(const float* rows, float (*to)[kChannels], int channels, int n) {
-    for (int i = 0; i < n; i += 8) {
-        V8 r[8];
-        for (int c = 0; c < 8; ++c) r[c] = c < channels ? get8(rows + c * kStride + i) : V8{};
-        transpose8(r);
-        for (int j = 0; j < 8; ++j) put8(to[i + j], r[j]);
-    }
-}
-
-DEEP void scatter(const Lookup& k, const float (*d)[kChannels], int valid, Gradient& g) {
-    float* out = g.texels;
-    const int count = std::min(k.count, valid - k.first);
-    for (int i = 0; i < count; ++i) {
-        const int ahead = i + kAhead < count ? i + kAhead : i;
-        for (int c = 0; c < 4; ++c) __builtin_prefetch(out + size_t(k.at[c][ahead]) * kChannels, 1);
-        const float fx = k.fx[i], fy = k.fy[i], w = k.weight[i];
-        const V8 v = get8(d[k.query[i]]);
-        const float share[4] = {w * (1 - fx) * (1 - fy), w * fx * (1 - fy), w * (1 - fx) * fy,
-                                w * fx * fy};
-        for (int c = 0; c < 4; ++c) {
-            float* p = out + size_t(k.at[c][i]) * kChannels;
-            put8(p, get8(p) + v * share[c]);
-            g.touched[k.at[c][i] >> 1] = 1;
-        }
-    }
-}
+// One tile of queries through the model and back: included after neumip_march.hpp, once a variant.
 
 // ---------------------------------------------------------------- one tile
 
@@ -197,7 +9,10 @@ struct Tile {
     Trace offset_trace, decoder_trace;
     Features offset_features, features[kMaxBanks];
     Levels levels;
-    Rows in, slopes;  // u v du_view dv_view du_light dv_light depth, and channels of one bank
+    // u v du_view dv_view du_light dv_light depth, of heights the ray, the crossing and its share
+    // of the depth, the gradient of the depth; and channels of one bank
+    Rows in, slopes;
+    Surface surface{};
     alignas(64) float direction[kDirections][kTile];
     alignas(64) float position[2][kTile];
     alignas(64) float gather[kTile][kChannels];
@@ -206,10 +21,12 @@ struct Tile {
     int ahead = 0, now = 0;
     bool fetched = false;
     Feed feed;
-    enum { kU, kV, kHu, kHv, kLu, kLv, kDepth, kMoveU, kMoveV, kInRows };
+    enum { kU, kV, kHu, kHv, kLu, kLv, kDepth, kRayU, kRayV, kLift, kCross, kSlope, kInRows };
 
-    NEUMIP_TARGET Tile(const Plan& p, const float* weights, const float* t, bool train)
+    NEUMIP_TARGET Tile(const Plan& p, const float* weights, const float* t, const Batch& b,
+                       bool train)
         : plan(p), texels(t) {
+        surface = {t, float(p.heights.w), float(p.heights.h), b.top, b.bottom, p.wrap};
         decoder.pack(p.decoder, weights, train);
         decoder_trace.reset(p.decoder, train);
         if (p.offset) {
@@ -275,14 +92,32 @@ struct Tile {
 
     NEUMIP_TARGET void set_view(const float* view, int valid, int n) {
         vectors(direction + 3, view, valid, n);
-        if (plan.offset) step(direction + 3, in[kHu], in[kHv], n);
+        if (plan.depth()) step(direction + 3, in[kHu], in[kHv], n);
+        if (!plan.heights.h) return;
+        for (int i = 0; i < n; i += L) {
+            const F z = load(direction[5] + i);
+            const F part = 1.f / larger(z, all(kSteepest)), scale = part * plan.depth_scale;
+            store(in[kRayU] + i, load(direction[3] + i) * scale);
+            store(in[kRayV] + i, load(direction[4] + i) * scale * -plan.aspect);
+            store(in[kLift] + i, larger(z, all(0.6f)) * part);
+        }
+    }
+
+    // Ray depths where the view rays of queries from..from+n meet the heights.
+    MEMBER void meet(int from, int n) {
+        for (int i = from; i < from + n; i += L) {
+            const F z = surface.crossing(load(in[kU] + i), load(in[kV] + i), load(in[kRayU] + i),
+                                         load(in[kRayV] + i));
+            store(in[kCross] + i, z);
+            store(in[kDepth] + i, z * load(in[kLift] + i));
+        }
     }
 
     NEUMIP_TARGET void set_light(const float* light, int valid, int n, bool same) {
         if (same)
             for (int c = 0; c < 3; ++c) std::fill(direction[c], direction[c] + n, light[c]);
         else vectors(direction, light, valid, n);
-        if (plan.offset && plan.needs_light()) step(direction, in[kLu], in[kLv], n);
+        if (plan.depth() && plan.needs_light()) step(direction, in[kLu], in[kLv], n);
         if (!plan.decoder.needs_half()) return;
         for (int i = 0; i < n; i += L) {
             F h[3];
@@ -346,6 +181,7 @@ struct Tile {
                 std::memcpy(s.in[kDepth] + from, s.offset_trace.x.back().base + from,
                             sizeof(float) * size);
             }
+            if (plan.heights.h) s.meet(from, size);
             look_up_features(s, from, size, half, valid, false);
             if (half == 0) s.wish(half, s.texels);
         }
@@ -359,7 +195,7 @@ struct Tile {
             if ((bank.light != 0) != lights) continue;
             list[1].count = 0;
             const float *u = s.in[kU] + from, *v = s.in[kV] + from;
-            if (plan.offset && (bank.view != 0 || bank.light != 0)) {
+            if (plan.depth() && (bank.view != 0 || bank.light != 0)) {
                 for (int i = from; i < from + size; i += L) {
                     const F r = load(s.in[kDepth] + i);
                     F hu = load(s.in[kHu] + i) * bank.view, hv = load(s.in[kHv] + i) * bank.view;
@@ -524,7 +360,7 @@ struct Tile {
         wish(1, g.texels);
         if (plan.offset) feed.add(offset_list[now], g.texels);
         const float* d = run_backward(decoder, decoder_trace, n, &feed);
-        float* depth = plan.offset ? offset_trace.d0.base : nullptr;
+        float* depth = plan.offset ? offset_trace.d0.base : plan.heights.h ? in[kSlope] : nullptr;
         if (depth) std::fill(depth, depth + n, 0.f);
         for (size_t k = 0; k < plan.banks.size(); ++k) {
             const Bank& bank = plan.banks[k];
@@ -538,6 +374,7 @@ struct Tile {
             if (depth && (bank.view != 0 || bank.light != 0)) slope(bank, f, d, depth, n);
             d += bank.channels * kStride;
         }
+        if (plan.heights.h) return move_heights(n, valid, g);
         if (!depth) return;
         feed.reset();
         if (next > 0) look_ahead(b, at + kTile, next);
@@ -545,6 +382,17 @@ struct Tile {
         d = run_backward(offset, offset_trace, n, &feed);
         from_rows(d, gather, plan.offset_bank.channels, n);
         scatter(offset_list[now], gather, valid, g);
+    }
+
+    NEUMIP_TARGET void move_heights(int n, int valid, Gradient& g) {
+        for (int i = 0; i < n; i += L) {
+            const F z = load(in[kCross] + i);
+            store(position[0] + i, load(in[kU] + i) + z * load(in[kRayU] + i));
+            store(position[1] + i, load(in[kV] + i) + z * load(in[kRayV] + i));
+            store(in[kSlope] + i, load(in[kSlope] + i) * load(in[kLift] + i));
+        }
+        scatter_heights(surface, position[0], position[1], in[kRayU], in[kRayV], in[kSlope], n,
+                        valid, g);
     }
 
     // Adds to the gradient of the depth what moves this bank's lookup.
@@ -578,7 +426,7 @@ inline int next_size(int64_t at, int64_t to) {
 NEUMIP_TARGET void evaluate(const Plan& plan, const float* weights, const float* texels,
                             const Batch& b, const float* lights, int64_t count, int64_t from,
                             int64_t to, float* rgb, bool raw) {
-    auto tile = std::make_unique<Tile>(plan, weights, texels, false);
+    auto tile = std::make_unique<Tile>(plan, weights, texels, b, false);
     const int64_t outputs = raw ? plan.decoder.widths.back() : plan.channels;
     for (int64_t at = from; at < to; at += kTile) {
         const int valid = int(std::min<int64_t>(kTile, to - at));
@@ -596,18 +444,18 @@ NEUMIP_TARGET void evaluate(const Plan& plan, const float* weights, const float*
 // Ray depth (to - from) of the offset stage, in tile widths.
 NEUMIP_TARGET void depths(const Plan& plan, const float* weights, const float* texels,
                           const Batch& b, int64_t from, int64_t to, float* out) {
-    auto tile = std::make_unique<Tile>(plan, weights, texels, false);
+    auto tile = std::make_unique<Tile>(plan, weights, texels, b, false);
     for (int64_t at = from; at < to; at += kTile) {
         const int valid = int(std::min<int64_t>(kTile, to - at));
         tile->stage_one(b, at, valid);
         for (int i = 0; i < valid; ++i)
-            out[at + i] = plan.offset ? tile->in[Tile::kDepth][i] * plan.depth_scale : 0.f;
+            out[at + i] = plan.depth() ? tile->in[Tile::kDepth][i] * plan.depth_scale : 0.f;
     }
 }
 
 NEUMIP_TARGET void train(const Plan& plan, const float* weights, const float* texels,
                          const Batch& b, int loss, int64_t from, int64_t to, Gradient& g) {
-    auto tile = std::make_unique<Tile>(plan, weights, texels, true);
+    auto tile = std::make_unique<Tile>(plan, weights, texels, b, true);
     const float scale = 1.f / (float(b.size) * float(plan.channels));
     for (int64_t at = from; at < to; at += kTile)
         tile->train(b, at, int(std::min<int64_t>(kTile, to - at)), next_size(at, to), loss, scale, g);

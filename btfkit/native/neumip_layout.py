@@ -1,0 +1,157 @@
+"""What a NeuMIP model looks like to its kernels.
+
+A model is two flat float32 arrays. `weights` holds the networks, layer by layer: (out, in)
+row-major, then the (out,) biases; the offset network first. `texels` (t, 8) holds all textures
+one after the other, row-major; a texture uses the first of the eight numbers of a texel. Heights
+lie before all textures, eight of them in the room of one texel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+Activation = Literal["linear", "relu", "leaky", "sine"]
+Output = Literal["log", "relu", "mask"]
+
+CHANNELS = 8  # numbers a texel
+LEAK = 0.01
+ACTIVATIONS: tuple[Activation, ...] = ("linear", "relu", "leaky", "sine")
+OUTPUTS: tuple[Output, ...] = ("log", "relu", "mask")
+DIRECTIONS = ("lx", "ly", "lz", "vx", "vy", "vz", "hx", "hy", "hz", "cos_diff", "level")
+
+
+@final
+@dataclass(frozen=True)
+class Pyramid:
+    """Textures of one kind, finest first, read together by level.
+
+    Attributes:
+        sizes: (h, w) of each level.
+        channels: numbers used of a texel, 1 to 8.
+        view, light: the lookup lies at uv + depth * (view * H(view) - light * H(light)).
+        shift: level of the data, log2(2 * footprint), at which the finest texture is right.
+    """
+
+    sizes: tuple[tuple[int, int], ...]
+    channels: int
+    view: float = 1.0
+    light: float = 0.0
+    shift: float = 0.0
+
+    @property
+    def texels(self) -> int:
+        return sum(h * w for h, w in self.sizes)
+
+
+@final
+@dataclass(frozen=True)
+class Network:
+    """A small dense network.
+
+    Attributes:
+        widths: inputs (features, then directions), hidden layers, outputs.
+        directions: which of `DIRECTIONS` follow the features.
+        activation: after every layer but the last.
+    """
+
+    widths: tuple[int, ...]
+    directions: tuple[str, ...]
+    activation: Activation = "relu"
+
+    @property
+    def size(self) -> int:
+        return sum((a + 1) * b for a, b in zip(self.widths, self.widths[1:], strict=False))
+
+    def layers(self, flat: NDArray[Any]) -> list[tuple[NDArray[Any], NDArray[Any]]]:
+        """(out, in) matrix and (out,) bias of each layer, as views of its flat weights."""
+        found, at = [], 0
+        for a, b in zip(self.widths, self.widths[1:], strict=False):
+            matrix = flat[at : at + a * b].reshape(b, a)
+            at += (a + 1) * b
+            found.append((matrix, flat[at - b : at]))
+        return found
+
+
+@final
+@dataclass(frozen=True)
+class Layout:
+    """All that decides a model's shape and how it is read.
+
+    Attributes:
+        decoder: features and directions to log(1 + rgb).
+        banks: pyramids whose features, one after the other, the decoder takes.
+        offset: the texture and network of the ray depth; None without them.
+        heights: (h, w) of a texture of heights, whose first crossing with the view ray gives the
+            ray depth in place of the network; None without it.
+        channels: of the answer. output: "log" as it comes, "relu" with negative numbers cut,
+            "mask" with the first half times 0.1 + sigmoid(second half).
+        aspect: tile width / tile height.
+        depth_scale: tile widths a unit of the offset network, or of the heights.
+        wrap: whether textures tile, or clamp at their borders.
+    """
+
+    decoder: Network
+    banks: tuple[Pyramid, ...]
+    offset: tuple[Pyramid, Network] | None = None
+    heights: tuple[int, int] | None = None
+    channels: int = 3
+    output: Output = "log"
+    aspect: float = 1.0
+    depth_scale: float = 1.0
+    wrap: bool = True
+
+    def __post_init__(self) -> None:
+        if self.offset and self.heights:
+            raise ValueError("a ray depth comes from a network or from heights, not from both")
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether lookups move with the view at all."""
+        return self.offset is not None or self.heights is not None
+
+    @property
+    def pyramids(self) -> tuple[Pyramid, ...]:
+        return ((self.offset[0],) if self.offset else ()) + self.banks
+
+    @property
+    def weights(self) -> int:
+        return (self.offset[1].size if self.offset else 0) + self.decoder.size
+
+    @property
+    def texels(self) -> int:
+        return self._rows_of_heights + sum(pyramid.texels for pyramid in self.pyramids)
+
+    @property
+    def _rows_of_heights(self) -> int:
+        return -(-self.heights[0] * self.heights[1] // CHANNELS) if self.heights else 0
+
+    @property
+    def needs_light(self) -> bool:
+        return any(bank.light for bank in self.banks)
+
+    def split(self, weights: Any) -> tuple[Any, Any]:
+        """The flat weights of the offset network (empty without one) and of the decoder."""
+        cut = self.offset[1].size if self.offset else 0
+        return weights[:cut], weights[cut:]
+
+    def textures(self, texels: Any) -> list[list[Any]]:
+        """(h, w, 8) views of each pyramid's levels; the offset texture first."""
+        found, at = [], self._rows_of_heights
+        for pyramid in self.pyramids:
+            levels = []
+            for h, w in pyramid.sizes:
+                levels.append(texels[at : at + h * w].reshape(h, w, CHANNELS))
+                at += h * w
+            found.append(levels)
+        return found
+
+    def surface(self, texels: Any) -> Any:
+        """(h, w) view of the heights, units of depth_scale."""
+        assert self.heights is not None
+        h, w = self.heights
+        return texels[: self._rows_of_heights].reshape(-1)[: h * w].reshape(h, w)
