@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from btfkit.bench import cells, kernels, run, tables
-from btfkit.bench.cases import procedural, stored
+from btfkit.bench import cells, kernels, run, tables, targets
+from btfkit.bench.cases import asked, procedural, stored
 from btfkit.cli import btfkit
 from btfkit.cli.outcome import run as run_cli
 from btfkit.errors import BtfkitError
@@ -60,8 +60,12 @@ def test_a_run_reports_the_contracts_errors_and_is_taken_up_again(tmp_path, monk
         assert row["queries_per_s"] > 0
     ours = found["cells"][2]
     assert 0.1 <= ours["cpu_seconds"] < 5
-    assert ours["parameters"] == 3429
+    assert 1000 < ours["parameters"] < 4000
     assert [level["level"] for level in ours["levels"]] == [0, 1, 2, 3, 4]
+    for level in ours["levels"]:
+        assert all(np.isfinite(level[key]) for key in CONTRACT)
+    assert ours["levels"][0]["flip"] == ours["flip"]
+    assert ours["machine"] == {key: found["machine"][key] for key in ours["machine"]}
     assert ours["curve"][-1]["cpu_s"] == pytest.approx(ours["cpu_seconds"])
     for name in ("bench.json", "bench.md", "rate-distortion.png", "time-to-error.png"):
         assert (tmp_path / "out" / name).stat().st_size > 500
@@ -118,22 +122,42 @@ def test_cells_are_told_apart_by_their_keys():
     assert sum(cell.budget_cpu_s == 1.0 for cell in found) == 2
 
 
-def test_targets_compare_with_the_published_recipe_and_without_offsets():
-    def row(model, budget, mse, **settings):
-        return {
-            "material": "m", "model": model, "settings": settings, "budget_cpu_s": budget,
-            "cpu_seconds": budget, "mse": 2 * mse, "mse_log1p": mse,
-            "psnr_log1p": -10 * np.log10(mse),
-        }  # fmt: skip
+def row(model, budget, mse, levels=(), material="m", **settings):
+    return {
+        "material": material, "model": model, "label": model, "settings": settings,
+        "budget_cpu_s": budget, "mse": 2 * mse, "mse_log1p": mse,
+        "psnr_log1p": -10 * np.log10(mse),
+        "levels": [{"level": n, "mse": value} for n, value in enumerate(levels)],
+    }  # fmt: skip
 
+
+def test_targets_compare_finished_runs_of_equal_budgets():
     rows = [
-        row("neumip", 5, 4e-3), row("neumip", 60, 1e-3), row("neumip", 60, 3e-3, offset="0"),
-        row("neumip-paper", 60, 2e-3),
+        row("neumip", 5, 4e-3), row("neumip", 15, 2e-3), row("neumip", 60, 1e-3),
+        row("neumip", 60, 3e-3, offset="0"), row("neumip-paper", 60, 3e-3),
+        row("neumip-paper", 600, 2e-3),
     ]  # fmt: skip
-    first, second = tables.targets(rows)
-    assert first["measured"] == "passed within 60.0 CPU s"
-    assert first["at equal time"] == "+3.01 dB"
-    assert second["measured"] == "3.00 x (log1p), 3.00 x (linear)"
+    passing, equal, offsets = targets.targets(rows)
+    assert passing["what"] == "neumip passes neumip-paper's 26.99 dB after 600 CPU s"
+    assert passing["measured"] == "within 15 CPU s: 26.99 dB"
+    assert equal["what"] == "neumip over neumip-paper, both after 60 CPU s"
+    assert equal["measured"] == "+4.77 dB"
+    assert offsets["measured"] == "3.00 x (log1p), 3.00 x (linear)"
+
+
+def test_targets_say_what_falls_short_and_compare_nothing_of_unequal_budgets():
+    rows = [row("neumip", 5, 4e-3), row("neumip", 15, 3e-3), row("neumip-paper", 60, 2e-3)]
+    (passing,) = targets.targets(rows)
+    assert passing["measured"] == "not passed: 25.23 dB after 15 CPU s"
+    assert targets.targets([row("neumip", 5, 4e-3), row("neumip", 9, 1e-3, offset="0")]) == []
+    assert targets.targets([{**row("neumip", 5, 1e-3), "failed": "no"}]) == []
+
+
+def test_targets_say_at_which_levels_the_error_rises():
+    (falling,) = targets.targets([row("neumip", 5, 4e-3, levels=(8.0, 4.0, 6.0, 2.0))])
+    assert falling["measured"] == "at 2 of 3 levels, 4.0 x over all; rises at 2 (1.50 x)"
+    (falling,) = targets.targets([row("neumip", 5, 4e-3, levels=(8.0, 4.0))])
+    assert falling["measured"] == "at 1 of 1 levels, 2.0 x over all"
 
 
 @compiled

@@ -29,7 +29,7 @@ def pyramid(size, levels, channels=7, **moves):
 
 def layout(
     activation="relu", output="log", *, offset=True, banks=None, levels=1, width=25, channels=3,
-    size=(37, 50), wrap=True, directions=("lx", "ly", "vx", "vy"),
+    size=(37, 50), wrap=True, directions=("lx", "ly", "vx", "vy"), heights=None,
 ):  # fmt: skip
     banks = banks or (pyramid(size, levels),)
     outputs = channels * (2 if output == "mask" else 1)
@@ -37,7 +37,7 @@ def layout(
     decoder = Network((inputs, width, width, width, outputs), directions, activation)
     stage = (pyramid(size, 1), Network((9, width, width, width, 1), ("vx", "vy"), activation))
     return Layout(
-        decoder, banks, stage if offset else None, channels=channels, output=output,
+        decoder, banks, stage if offset and not heights else None, heights, channels=channels, output=output,
         aspect=1.35, depth_scale=0.02, wrap=wrap,
     )  # fmt: skip
 
@@ -60,6 +60,9 @@ CASES = {
     "nine channels": layout("relu", channels=9, levels=3, width=31),
     "one texel": layout("sine", size=(1, 1)),
     "one row": layout("sine", size=(1, 13), levels=3),
+    "heights": layout("leaky", levels=6, heights=(37, 50), directions=ALL),
+    "heights, three banks, clamped": layout(banks=THREE_BANKS, wrap=False, heights=(11, 14)),
+    "one height": layout(heights=(1, 1)),
 }
 
 
@@ -87,6 +90,10 @@ def parameters(case, rng):
     for p, levels in zip(case.pyramids, case.textures(texels), strict=True):
         for texture in levels:
             texture[..., : p.channels] = rng.standard_normal((*texture.shape[:2], p.channels))
+    if case.heights:
+        rows, cols = np.indices(case.heights) / np.reshape(case.heights, (2, 1, 1)) * 2 * np.pi
+        noise = 0.1 * rng.standard_normal(case.heights)
+        case.surface(texels)[:] = np.sin(cols + 2 * rows) + np.cos(3 * rows) + noise
     return weights, texels
 
 
@@ -109,6 +116,11 @@ def apart_from_kinks(case, weights, texels, parts):
     uv, light, view, footprint = doubles
     depth = plain.depths_plain(case, weights.astype(float), texels.astype(float), uv, view)
     away = np.ones(len(uv), bool)
+    if case.heights:
+        # Which of two crossings a grazing ray meets first is rounding's choice, too.
+        single = plain.depths_plain(case, weights, texels, parts[0], parts[2])
+        away = np.abs(single - depth) < 1e-6 + 1e-4 * np.abs(depth)
+        check_rays(case, texels, uv, view, depth, away)
 
     def check(at, sizes):
         for h, w in sizes:
@@ -118,7 +130,7 @@ def apart_from_kinks(case, weights, texels, parts):
     if case.offset:
         check(uv, case.offset[0].sizes)
     for bank in case.banks:
-        move = bank.view * plain.step(view, case) - bank.light * native.step(light, case)
+        move = bank.view * plain.step(view, case) - bank.light * plain.step(light, case)
         check(uv + depth[:, None] * move, bank.sizes)
     if footprint is not None:
         for bank in case.banks:
@@ -126,6 +138,21 @@ def apart_from_kinks(case, weights, texels, parts):
             near = np.abs(level - np.rint(level)) < 1e-4
             away &= ~near | (level <= 0)
     return away
+
+
+def check_rays(case, texels, uv, view, depth, away):
+    """Leaves out crossings at texel borders, and those about to be held back for grazing."""
+    along = plain.ray(view, case)
+    place = uv + (depth / plain.lift(view) / case.depth_scale)[:, None] * along
+    h, w = case.heights
+    x = place * [w, h] - 0.5
+    away[(np.abs(x - np.rint(x)) < 1e-4 * np.maximum(1, np.abs(x))).any(axis=1)] = False
+    surface = case.surface(texels).astype(float)[..., None]
+    ahead, behind = (
+        plain.bilinear(surface, place + side * 1e-6 * along, wrap=case.wrap)[:, 0]
+        for side in (1, -1)
+    )
+    away[np.abs(1 - (ahead - behind) / 2e-6 - plain.FLATTEST) < 1e-2] = False
 
 
 def relative(found, wanted):

@@ -26,28 +26,62 @@ _LOWEST_Z = 0.3
 
 @final
 @dataclass(frozen=True, eq=False)
+class Coarse:
+    """The held-out pictures at one level of detail, as small as that level is.
+
+    Attributes:
+        level: 1 for the first beyond the sharp one. footprint: its blur, texels of the data.
+        uv: (r, s, 2) places. light, view: (p, r, s, 3) there. images: (p, r, s, c).
+    """
+
+    level: int
+    footprint: float
+    uv: NDArray[np.float64]
+    light: NDArray[np.float32]
+    view: NDArray[np.float32]
+    images: NDArray[np.float32]
+
+
+@final
+@dataclass(frozen=True, eq=False)
 class Case:
     """One material of the benchmark.
 
     Attributes:
         name: of the material.
-        train: the BTF that models are fitted to, in memory.
-        pictures: held-out pairs, whole, in memory.
-        queries: texels of the pictures at every level of detail, with their footprints.
+        train: the BTF or the queries that models are fitted to, in memory.
+        queries: held out: rows of a query file, or texels of the pictures at every level of detail.
+        pictures: held-out pairs, whole, in memory; None where the data are queries.
+        coarse: the pictures at every level but the sharp one.
     """
 
     name: str
-    train: BTF
-    pictures: BTF
+    train: BTF | QuerySet
     queries: QuerySet
+    pictures: BTF | None = None
+    coarse: tuple[Coarse, ...] = ()
+
+    @property
+    def samples(self) -> int:
+        """Values that there are to train on, of all channels together."""
+        train = self.train
+        return len(train) if isinstance(train, QuerySet) else int(np.prod(train.shape[:3]))
 
     def describe(self) -> dict[str, object]:
         """Sizes, as JSON types."""
-        _, h, w, c = self.train.shape
+        train = self.train
+        provenance = dict(train.provenance)
+        if isinstance(train, QuerySet):
+            return {
+                "rows": len(train), "held_out_rows": len(self.queries),
+                "size": None if train.size is None else list(train.size),
+                "channels": len(train.channels), "provenance": provenance,
+            }  # fmt: skip
+        _, h, w, c = train.shape
         return {
-            "pairs": len(self.train), "held_out_pairs": len(self.pictures),
-            "size": [h, w], "channels": c, "wrap": self.train.wrap,
-            "provenance": dict(self.train.provenance),
+            "pairs": len(train),
+            "held_out_pairs": 0 if self.pictures is None else len(self.pictures),
+            "size": [h, w], "channels": c, "wrap": train.wrap, "provenance": provenance,
         }  # fmt: skip
 
 
@@ -76,12 +110,36 @@ def stored(path: Path, *, holdout: float, seed: int) -> Case:
     btf = io.open(path)
     train, test = split(len(btf), holdout, seed)
     shown = np.random.default_rng(seed).permutation(test)[:_PICTURES]
-    return _case(path.name.removesuffix(".btf.zarr"), btf.subset(train), btf.subset(shown))
+    return _case(name_of(path), btf.subset(train), btf.subset(shown))
+
+
+def asked(path: Path, *, holdout: float, seed: int) -> Case:
+    """A query file: the rows that `fit` would hold out.
+
+    Raises:
+        ValueError: the file has no answers, or no held-out row can be compared with.
+    """
+    from btfkit.io import queryfile
+
+    queries = queryfile.read(path)
+    if queries.rgb is None:
+        raise ValueError(f"{path} has no answers (rgb): there is nothing to fit")
+    train, test = split(len(queries), holdout, seed)
+    held = queries.subset(test)
+    if not held.valid().any():
+        raise ValueError(f"none of the {len(test)} held-out rows of {path} can be compared with")
+    return Case(name_of(path), queries.subset(train), held)
+
+
+def name_of(source: str | Path) -> str:
+    """What a material is called in tables and file names."""
+    return source if isinstance(source, str) else source.name.removesuffix(".btf.zarr")
 
 
 def _case(name: str, train: BTF, pictures: BTF) -> Case:
     train, pictures = _in_memory(train, np.float16), _in_memory(pictures, np.float32)
-    return Case(name, train, pictures, _levels(pictures))
+    queries, coarse = _levels(pictures)
+    return Case(name, train, queries, pictures, coarse)
 
 
 def _in_memory(btf: BTF, dtype: type[np.floating]) -> BTF:
@@ -94,27 +152,51 @@ def _in_memory(btf: BTF, dtype: type[np.floating]) -> BTF:
     return replace(btf, textures=as_textures(images))
 
 
-def _levels(btf: BTF) -> QuerySet:
-    """Texels of every picture, sharp and blurred to each level as the contract defines them."""
+def _levels(btf: BTF) -> tuple[QuerySet, tuple[Coarse, ...]]:
+    """Every picture sharp and blurred to each level as the contract defines them.
+
+    Returns:
+        Texels at random of all of them, and the blurred ones as small pictures.
+    """
     _, h, w, _ = btf.shape
     rng = np.random.default_rng(3)
     centres = texel_centres(h, w).reshape(h * w, 2)
     parts: list[Sequence[NDArray[Any]]] = []
+    coarse = []
     for level in range(max(h, w).bit_length()):
         footprint = 0.5 * 2.0**level
         down, across = (
             gaussian(side, footprint**2 - 0.25, wrap=btf.wrap == "wrap") for side in (h, w)
         )
-        for pair in range(len(btf)):
+        images = [blurred(btf.texture(pair), down, across) for pair in range(len(btf))]
+        for pair, image in enumerate(images):
             texels = rng.permutation(h * w)[: max(_TEXELS >> level, 64)]
-            image = blurred(btf.texture(pair), down, across).reshape(h * w, -1)
             directions = (d(pair).reshape(h * w, 3)[texels] for d in (btf.light_at, btf.view_at))
             blur = np.full(len(texels), footprint, np.float32)
-            parts.append((centres[texels], *directions, blur, image[texels]))
+            parts.append((centres[texels], *directions, blur, image.reshape(h * w, -1)[texels]))
+        if level:
+            coarse.append(_coarse(btf, level, footprint, images))
     uv, light, view, blur, rgb = (
         np.concatenate(column).astype(np.float32) for column in zip(*parts, strict=True)
     )
-    return QuerySet(uv, light, view, footprint=blur, rgb=rgb, size=(h, w), channels=btf.channels)
+    queries = QuerySet(
+        uv, light, view, footprint=blur, rgb=rgb, size=(h, w), channels=btf.channels
+    )
+    return queries, tuple(coarse)
+
+
+def _coarse(btf: BTF, level: int, footprint: float, images: list[NDArray[Any]]) -> Coarse:
+    """Every 2^level-th texel of blurred pictures; of a shorter side the middle one."""
+    _, h, w, _ = btf.shape
+    rows, cols = (
+        np.arange(min(2**level, side) // 2, side, 2**level, dtype=np.intp) for side in (h, w)
+    )
+    at = np.ix_(rows, cols)
+    light, view = (
+        np.stack([d(pair)[at] for pair in range(len(btf))]) for d in (btf.light_at, btf.view_at)
+    )
+    small = np.stack([image[at] for image in images]).astype(np.float32)
+    return Coarse(level, footprint, texel_centres(h, w)[at], light, view, small)
 
 
 def _cap(rng: np.random.Generator, count: int) -> NDArray[np.float32]:

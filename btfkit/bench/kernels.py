@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from btfkit import metrics
-from btfkit.bench.cells import peak
+from btfkit.bench.machine import peak
 from btfkit.btf import BTF
 from btfkit.fitting.neumip import NeuMIP
 from btfkit.fitting.neumip_start import initial_texels, initial_weights

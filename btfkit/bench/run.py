@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
-import os
-import platform
-import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,14 +10,14 @@ from typing import Any, final
 
 import numpy as np
 
-from btfkit import native
-from btfkit.bench import kernels, plots, tables
-from btfkit.bench.cases import Case, procedural, stored
-from btfkit.bench.cells import Cell, cells_of, peak, run_cell
+from btfkit.bench import kernels, plots, tables, targets
+from btfkit.bench.cases import Case, asked, name_of, procedural, stored
+from btfkit.bench.cells import Cell, cells_of, refusal, run_cell, run_together, shared_cells
+from btfkit.bench.machine import machine
 from btfkit.errors import BtfkitError
 from btfkit.files import whole
 from btfkit.fitting import MODELS
-from btfkit.native.neumip import available, variants
+from btfkit.native.neumip import available
 
 Progress = Callable[[float, float], None]
 
@@ -32,10 +28,10 @@ class Profile:
     """How much is run.
 
     Attributes:
-        materials: of the catalogue. stores: further ones, from files.
-        models: by name. budgets_cpu_s: of every trained model.
+        materials: of the catalogue. stores: further ones, from files, query files among them.
+        models: by name. budgets_cpu_s: of every trained model, ascending.
         size: texels a side. directions: lights, and views, of the traced materials.
-        holdout: share of the pairs of stores that are held out.
+        holdout: share of the pairs of stores, and of the rows of query files, that are held out.
         seed: of data and models. kernel_seconds: a figure of the kernel tables; 0 for none.
     """
 
@@ -49,6 +45,11 @@ class Profile:
     seed: int = 0
     kernel_seconds: float = 0.5
 
+    @property
+    def sources(self) -> tuple[str | Path, ...]:
+        """Materials and stores, in the order in which they are run."""
+        return (*self.materials, *self.stores)
+
 
 QUICK = Profile(
     materials=("cobbles", "print"), budgets_cpu_s=(0.5, 1.5), size=48, directions=12,
@@ -57,7 +58,10 @@ QUICK = Profile(
 
 
 def run(profile: Profile, folder: Path, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Run what of a profile is not in `folder` yet, and write its tables, plots and JSON there.
+    """Run what of a profile is not in `folder` yet; write tables, plots and JSON of all in it.
+
+    Several processes may run different materials, models or budgets into one folder at a time:
+    cells appear whole, and who ends last writes tables of all of them.
 
     Args:
         profile: what is wanted.
@@ -68,59 +72,88 @@ def run(profile: Profile, folder: Path, *, progress: Progress | None = None) -> 
         What bench.json holds: machine, profile, cells, tables, targets.
 
     Raises:
-        ValueError: an unknown model or material.
+        ValueError: an unknown model or material, or two materials of one name.
         BtfkitError: `folder` holds cells of another profile.
     """
     _check(profile)
     folder.mkdir(parents=True, exist_ok=True)
     _claim(folder, profile)
-    names: list[str | Path] = [*profile.materials, *profile.stores]
-    planned = [(name, _planned(name, profile)) for name in names]
-    total = sum(len(cells) for _, cells in planned) + 1
-    rows: list[dict[str, Any]] = []
-    for name, cells in planned:
-        case: Case | None = None
-        for cell in cells:
-            kept = folder / "cells" / f"{cell.key}.json"
-            if not kept.is_file():
-                case = case or _case(name, profile)
-                _write(kept, {**_run_or_say_why(cell, case), "case": case.describe()})
-            rows.append(json.loads(kept.read_text()))
-            if progress:
-                progress(len(rows), total)
+    _run_missing(profile, folder, progress)
+    rows = cells_in(folder, profile)
     found = {
         "machine": machine(),
         "profile": json.loads(json.dumps(asdict(profile), default=str)),
         "cells": rows,
         **_kernels(folder, profile),
+        "targets": targets.targets(rows),
     }
-    found["targets"] = tables.targets(rows)
     good = [row for row in rows if "failed" not in row]
-    plots.rate_distortion(good, folder / "rate-distortion.png")
-    plots.time_to_error(good, folder / "time-to-error.png")
-    (folder / "bench.md").write_text(tables.markdown(found))
+    for name, draw in (
+        ("rate-distortion.png", plots.rate_distortion),
+        ("time-to-error.png", plots.time_to_error),
+    ):
+        with whole(folder / name, force=True) as partial:
+            draw(good, partial)
+    with whole(folder / "bench.md", force=True) as partial:
+        partial.write_text(tables.markdown(found))
     _write(folder / "bench.json", found)
-    if progress:
-        progress(total, total)
     return found
 
 
-def machine() -> dict[str, Any]:
-    """Processor, compiler and versions that figures depend on."""
-    return {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "threads": native.threads(),
-        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
-        "python": platform.python_version(),
-        "compiler": _compiler(),
-        "kernels": native.in_use(),
-        "variants": variants(),
-        "peak_gflops_one_thread": peak() / 1e9 if available() else None,
-        "versions": {
-            name: importlib.metadata.version(name) for name in ("btfkit", "numpy", "torch")
-        },
-    }
+def cells_in(folder: Path, profile: Profile) -> list[dict[str, Any]]:
+    """Every finished cell of a folder: materials in the order asked for, then what else lies there,
+    models in the order of `MODELS`, budgets ascending.
+    """
+    rows = [json.loads(path.read_text()) for path in sorted((folder / "cells").glob("[!.]*.json"))]
+    first = [name_of(source) for source in profile.sources]
+    materials = [*first, *sorted({row["material"] for row in rows} - set(first))]
+    models = list(MODELS)
+
+    def order(row: Mapping[str, Any]) -> tuple[Any, ...]:
+        model = row["model"]
+        return (
+            materials.index(row["material"]),
+            models.index(model) if model in models else len(models),
+            [(k, len(v), v) for k, v in row["settings"].items()],
+            row["budget_cpu_s"] or 0,
+        )
+
+    return sorted(rows, key=order)
+
+
+def _run_missing(profile: Profile, folder: Path, progress: Progress | None) -> None:
+    """Run the planned cells that are not in the folder: each material's own, then shared ones."""
+    names = [name_of(source) for source in profile.sources]
+    planned = [
+        cells_of(name, profile.models, profile.budgets_cpu_s, seed=profile.seed, size=profile.size)
+        for name in names
+    ]
+    pictured = [s for s in profile.sources if isinstance(s, str) or not _has_queries(s)]
+    together = shared_cells(
+        [name_of(source) for source in pictured], profile.models, profile.budgets_cpu_s,
+        seed=profile.seed,
+    )  # fmt: skip
+    missing = not all(_file(folder, cell).is_file() for cell in together)
+    total = sum(map(len, planned)) + len(together)
+    done = 0
+    cases: list[Case] = []
+    for source, cells in zip(profile.sources, planned, strict=True):
+        case: Case | None = None
+        for cell in cells:
+            if not _file(folder, cell).is_file():
+                case = case or _case(source, profile)
+                _keep(folder, cell, _run_or_say_why(cell, case), case)
+            done += 1
+            if progress:
+                progress(done, total)
+        if missing and source in pictured:
+            cases.append(case or _case(source, profile))
+    if missing:
+        rows = _run_together_or_say_why(together, cases)
+        for cell, row, case in zip(together, rows, cases, strict=True):
+            _keep(folder, cell, row, case)
+    if progress:
+        progress(total, total)
 
 
 def _check(profile: Profile) -> None:
@@ -133,6 +166,12 @@ def _check(profile: Profile) -> None:
         unknown = [name for name in given if name not in known]
         if unknown:
             raise ValueError(f"no {kind} {unknown[0]!r}; there are {', '.join(known)}")
+    names = [name_of(source) for source in profile.sources]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ValueError(
+            f"two materials are called {twice[0]!r}, and results are kept by name: rename a store"
+        )
 
 
 def _claim(folder: Path, profile: Profile) -> None:
@@ -147,17 +186,17 @@ def _claim(folder: Path, profile: Profile) -> None:
     _write(mark, decisive)
 
 
-def _planned(name: str | Path, profile: Profile) -> list[Cell]:
-    label = name if isinstance(name, str) else name.name.removesuffix(".btf.zarr")
-    return cells_of(
-        label, profile.models, profile.budgets_cpu_s, seed=profile.seed, size=profile.size
-    )
+def _case(source: str | Path, profile: Profile) -> Case:
+    if isinstance(source, str):
+        return procedural(
+            source, size=profile.size, directions=profile.directions, seed=profile.seed
+        )
+    read = asked if _has_queries(source) else stored
+    return read(source, holdout=profile.holdout, seed=profile.seed)
 
 
-def _case(name: str | Path, profile: Profile) -> Case:
-    if isinstance(name, Path):
-        return stored(name, holdout=profile.holdout, seed=profile.seed)
-    return procedural(name, size=profile.size, directions=profile.directions, seed=profile.seed)
+def _has_queries(path: Path) -> bool:
+    return path.suffix.lower() == ".npz"
 
 
 def _run_or_say_why(cell: Cell, case: Case) -> dict[str, Any]:
@@ -165,18 +204,21 @@ def _run_or_say_why(cell: Cell, case: Case) -> dict[str, Any]:
     try:
         return run_cell(cell, case)
     except (BtfkitError, ValueError) as error:
-        return {
-            "material": cell.material, "model": cell.model, "label": cell.label,
-            "settings": dict(cell.settings), "budget_cpu_s": cell.budget_cpu_s,
-            "failed": str(error),
-        }  # fmt: skip
+        return refusal(cell, error)
+
+
+def _run_together_or_say_why(cells: Sequence[Cell], cases: Sequence[Case]) -> list[dict[str, Any]]:
+    try:
+        return run_together(cells, cases)
+    except (BtfkitError, ValueError) as error:
+        return [refusal(cell, error) for cell in cells]
 
 
 def _kernels(folder: Path, profile: Profile) -> dict[str, Any]:
-    if profile.kernel_seconds <= 0 or not available():
-        return {}
     kept = folder / "kernels.json"
     if not kept.is_file():
+        if profile.kernel_seconds <= 0 or not available():
+            return {}
         seconds = profile.kernel_seconds
         _write(
             kept,
@@ -189,6 +231,14 @@ def _kernels(folder: Path, profile: Profile) -> dict[str, Any]:
         )
     found: dict[str, Any] = json.loads(kept.read_text())
     return found
+
+
+def _file(folder: Path, cell: Cell) -> Path:
+    return folder / "cells" / f"{cell.key}.json"
+
+
+def _keep(folder: Path, cell: Cell, row: Mapping[str, Any], case: Case) -> None:
+    _write(_file(folder, cell), {**row, "case": case.describe()})
 
 
 def _write(path: Path, value: Mapping[str, Any]) -> None:
@@ -208,23 +258,3 @@ def _json(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return str(value)
     return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    names = [
-        line.split(":", 1)[1].strip()
-        for line in (info.read_text().splitlines() if info.is_file() else ())
-        if line.startswith("model name")
-    ]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
-def _compiler() -> str:
-    for name in ("c++", "g++", "clang++"):
-        try:
-            out = subprocess.run([name, "--version"], capture_output=True, text=True, check=True)
-        except (OSError, subprocess.CalledProcessError):
-            continue
-        return out.stdout.splitlines()[0]
-    return "none found"

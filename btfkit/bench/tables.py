@@ -1,9 +1,11 @@
-"""The benchmark in words: tables for people, and how far its targets are met."""
+"""The benchmark in words: tables for people."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
+
+from btfkit.bench.machine import same
 
 Row = Mapping[str, Any]
 
@@ -12,18 +14,22 @@ def markdown(found: Mapping[str, Any]) -> str:
     """Everything that bench.json holds, as a page."""
     machine = found["machine"]
     peak = machine["peak_gflops_one_thread"]
+    rows = found["cells"]
     parts = [
         "# btfkit bench\n",
         f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads; "
         f"{machine['system']}; "
         f"{machine['compiler']}; Python {machine['python']}; kernels {machine['variants']}; "
         + (f"measured peak {peak:.0f} GFLOP/s a thread.\n" if peak else "no kernels built.\n"),
+        others(rows, machine),
     ]
-    rows = found["cells"]
     for material in dict.fromkeys(row["material"] for row in rows):
-        parts.append(f"## {material}\n")
-        parts.append(cells([row for row in rows if row["material"] == material]))
-        parts.append(levels([row for row in rows if row["material"] == material]))
+        here = [row for row in rows if row["material"] == material]
+        parts += [f"## {material}\n", cells(here)]
+        parts += [
+            levels(here, "mse x 1e-3 by level", lambda level: f"{1e3 * level['mse']:.3f}"),
+            levels(here, "log1p dB by level", lambda level: f"{float(level['psnr_log1p']):.2f}"),
+        ]
     for title, key in (
         ("Kernels, one thread", "kernels"),
         ("The loop beside its kernel", "loop"),
@@ -34,6 +40,24 @@ def markdown(found: Mapping[str, Any]) -> str:
             parts += [f"## {title}\n", generic(found[key])]
     parts += ["## Targets\n", generic(found["targets"])]
     return "\n".join(part for part in parts if part) + "\n"
+
+
+def others(rows: Sequence[Row], machine: Row) -> str:
+    """Which cells come from elsewhere than the machine that is named; empty where none does."""
+    kinds: dict[str, int] = {}
+    for row in rows:
+        place = row.get("machine")
+        if place is None:
+            kind = "an unnamed machine"
+        elif same(place, machine):
+            continue
+        else:
+            kind = f"{place['processor']}, {place['cores']} cores, {place['threads']} threads"
+        kinds[kind] = kinds.get(kind, 0) + 1
+    if not kinds:
+        return ""
+    text = "; ".join(f"{count} of {len(rows)} cells on {kind}" for kind, count in kinds.items())
+    return f"Measured elsewhere: {text}. Times and rates of those are not comparable.\n"
 
 
 def cells(rows: Sequence[Row]) -> str:
@@ -47,32 +71,35 @@ def cells(rows: Sequence[Row]) -> str:
         if "failed" in row:
             lines.append([row["label"], row["failed"][:80], *[""] * (len(names) - 2)])
             continue
-        share, memory = row["share_of_peak"], row["peak_memory_bytes"]
         lines.append(
             [
-                row["label"], f"{row['cpu_seconds']:.1f}", f"{row['seconds']:.1f}", row["steps"],
-                f"{row['psnr_log1p']:.2f}", f"{row['psnr']:.2f}", f"{row['psnr_srgb']:.2f}",
-                f"{row['ssim_srgb']:.3f}", f"{row['flip']:.3f}", row["parameters"],
-                f"{row['bytes'] / 1e3:.0f}", f"{row['queries_per_cpu_s'] / 1e6:.2f}",
-                "" if share is None else f"{100 * share:.0f}",
-                "" if memory is None else f"{memory / 1e6:.0f}",
+                row["label"], _in("{:.1f}", row["cpu_seconds"]), _in("{:.1f}", row["seconds"]),
+                row["steps"], _in("{:.2f}", row["psnr_log1p"]), _in("{:.2f}", row["psnr"]),
+                _in("{:.2f}", row.get("psnr_srgb")), _in("{:.3f}", row.get("ssim_srgb")),
+                _in("{:.3f}", row.get("flip")), row["parameters"],
+                _in("{:.0f}", row["bytes"], 1e-3), _in("{:.2f}", row["queries_per_cpu_s"], 1e-6),
+                _in("{:.0f}", row["share_of_peak"], 100),
+                _in("{:.0f}", row["peak_memory_bytes"], 1e-6),
             ]
         )  # fmt: skip
     return _table(names, lines)
 
 
-def levels(rows: Sequence[Row]) -> str:
-    """Error by level of detail, of the models that have levels, longest budgets."""
+def levels(rows: Sequence[Row], title: str, say: Any) -> str:
+    """Error by level of detail, of the models that have levels, longest budgets.
+
+    Args:
+        title: of the first column. say: the text of one level's errors.
+    """
     chosen = {row["label"]: row for row in rows if row.get("levels")}
     if not chosen:
         return ""
-    count = max(len(row["levels"]) for row in chosen.values())
-    names = ["mse x 1e-3 by level", *map(str, range(count))]
-    lines = [
-        [label, *(f"{1e3 * level['mse']:.3f}" for level in row["levels"])]
-        for label, row in chosen.items()
-    ]
-    return _table(names, lines)
+    every = sorted({level["level"] for row in chosen.values() for level in row["levels"]})
+    lines = []
+    for label, row in chosen.items():
+        by_level = {level["level"]: say(level) for level in row["levels"]}
+        lines.append([label, *(by_level.get(level, "") for level in every)])
+    return _table([title, *map(str, every)], lines)
 
 
 def generic(rows: Sequence[Row]) -> str:
@@ -83,50 +110,14 @@ def generic(rows: Sequence[Row]) -> str:
     return _table(names, [[_short(row[name]) for name in names] for row in rows])
 
 
-def targets(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """NeuMIP against its published recipe, and with against without its offset stage."""
-    found = []
-    good = [row for row in rows if "failed" not in row]
-    for material in dict.fromkeys(row["material"] for row in good):
-        here = [row for row in good if row["material"] == material]
-        ours = _runs(here, "neumip", {})
-        paper = _runs(here, "neumip-paper", {})
-        if ours and paper:
-            first = next((r for r in ours if r["mse_log1p"] <= paper[-1]["mse_log1p"]), None)
-            gain = ours[-1]["psnr_log1p"] - paper[-1]["psnr_log1p"]
-            found.append(
-                {
-                    "material": material,
-                    "what": f"error of neumip-paper after {paper[-1]['cpu_seconds']:.0f} CPU s "
-                    f"({paper[-1]['psnr_log1p']:.2f} dB)",
-                    "measured": "not passed"
-                    if first is None
-                    else f"passed within {first['cpu_seconds']:.1f} CPU s",
-                    "at equal time": f"{gain:+.2f} dB",
-                }
-            )
-        flat = _runs(here, "neumip", {"offset": "0"})
-        if ours and flat:
-            log, linear = (flat[-1][key] / ours[-1][key] for key in ("mse_log1p", "mse"))
-            found.append(
-                {
-                    "material": material,
-                    "what": "offset stage lowers the mse",
-                    "measured": f"{log:.2f} x (log1p), {linear:.2f} x (linear)",
-                    "at equal time": "",
-                }
-            )
-    return found
-
-
-def _runs(rows: Iterable[Row], model: str, settings: Mapping[str, str]) -> list[Row]:
-    chosen = [row for row in rows if row["model"] == model and row["settings"] == settings]
-    return sorted(chosen, key=lambda row: row["budget_cpu_s"] or 0)
-
-
 def _table(names: Sequence[Any], lines: Iterable[Sequence[Any]]) -> str:
     rows = [list(map(str, names)), ["---"] * len(names), *(list(map(str, line)) for line in lines)]
     return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+
+
+def _in(form: str, value: Any, times: float = 1) -> str:
+    """A number as text, nothing where there is none; infinity may come as text from JSON."""
+    return "" if value is None else form.format(float(value) * times)
 
 
 def _short(value: Any) -> str:

@@ -24,6 +24,11 @@ from btfkit.materials.neumip import NeuMIPSpec, aligned
 from btfkit.native.neumip import Kernel, available
 from btfkit.native.neumip_layout import Array
 
+_SMOOTH_STEPS = 16
+_SMOOTH_HALVES = 5
+# Texels squared; what is left of a blur below it changes nothing.
+_LEAST_BLUR = 2e-3
+
 
 @final
 class NeuMIP(Recipe):
@@ -41,6 +46,7 @@ class NeuMIP(Recipe):
             coarse=s.coarse,
             light=s.light if s.offset else 0,
             offset=s.offset,
+            heights=bool(s.offset) and s.depth == "heights",
             hidden=(s.width,) * 3,
             offset_hidden=(s.offset_width,) * 3,
             activation=s.activation,  # type: ignore[arg-type]
@@ -95,10 +101,14 @@ class NeuMIP(Recipe):
                 adam_plain(slots, grown, rate, self._steps, (0.9, s.beta2), dense=dense)
         # Few directions say little about those between: small weights bend little.
         arrays["weights"] *= np.float32(1 - rates[0] * self._decay)
-        if s.smooth and self._steps % 16 == 0:
-            self._smooth(s.smooth * 2 ** (-9 * progress))
-        # A depth that is no number is looked up at a border, with a finite loss: look at weights.
-        return loss if np.isfinite(arrays["weights"]).all() else math.nan
+        if s.smooth and self._steps % _SMOOTH_STEPS == 0:
+            self._smooth(s.smooth * 2 ** (-_SMOOTH_HALVES * progress))
+        # A depth that is no number is looked up at a border, with a finite loss: look at what
+        # depths come from.
+        good = np.isfinite(arrays["weights"]).all()
+        if self.layout.heights:
+            good &= np.isfinite(self.layout.surface(arrays["texels"])).all()
+        return loss if good else math.nan
 
     def _batch_size(self, progress: float) -> int:
         if self.settings.batch:
@@ -129,16 +139,19 @@ class NeuMIP(Recipe):
         return float(loss.detach())
 
     def _smooth(self, sigma: float) -> None:
-        if sigma < 0.03:
-            return
-        wrap = self.layout.wrap
-        for levels in self.layout.textures(self._arrays["texels"]):
-            for texture in levels[:1]:
-                h, w, _ = texture.shape
-                for axis, side in ((0, h), (1, w)):
-                    share = np.float32(min(sigma**2 / 2, 0.25))
-                    if side > 1:
-                        texture += share * _laplacian(texture, axis, wrap=wrap)
+        """Blur the finest textures: a relief is found from its large forms to its small ones."""
+        layout, texels = self.layout, self._arrays["texels"]
+        finest = [levels[0] for levels in layout.textures(texels)]
+        if layout.heights:
+            finest.append(layout.surface(texels)[..., None])
+        for texture in finest:
+            variance = sigma**2
+            while variance > _LEAST_BLUR:
+                for axis in (0, 1):
+                    if texture.shape[axis] > 1:
+                        share = np.float32(min(variance / 2, 0.25))
+                        texture += share * _laplacian(texture, axis, wrap=layout.wrap)
+                variance -= 0.5
 
 
 def _laplacian(texture: Array, axis: int, *, wrap: bool) -> Array:

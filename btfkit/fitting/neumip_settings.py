@@ -17,6 +17,8 @@ class Settings:
         levels: of detail; 0: a whole pyramid for textures, as the footprints need for queries.
         size: rows of the finest texture; 0: the data's own.
         features, coarse, light, offset: channels, as in `NeuMIPSpec`.
+        depth: "heights" finds ray depths in a texture of heights, "network" in the offset texture
+            and network as published; `offset` 0 leaves either out.
         width, offset_width: of the three hidden layers of each network.
         activation, offset_activation: "relu", "leaky" or "sine".
         inputs: "xy" as published, "half" with the half vector beside it, "full" with all cosines,
@@ -29,7 +31,8 @@ class Settings:
         decay: of the weights a unit of learning rate, for few direction pairs: divided by how many
             times 60 of them there are. Queries each have a pair of their own, and next to none.
         omega: factor on the first layers' initial weights where they end in sines.
-        smooth: texels of blur a pass while training begins; it halves nine times in a run.
+        smooth: texels by which textures are blurred every 16 steps while training begins; it
+            halves five times in a run.
         precision: of the saved textures: float32, float16 or int8.
         pool_mb: memory for textures.
         wrap: of query files, which do not say it themselves.
@@ -41,6 +44,7 @@ class Settings:
     coarse: int = 0
     light: int = 0
     offset: int = 7
+    depth: str = "heights"
     width: int = 25
     offset_width: int = 25
     activation: str = "leaky"
@@ -55,7 +59,7 @@ class Settings:
     beta2: float = 0.99
     decay: float = 1.0
     omega: float = 1.0
-    smooth: float = 0.0
+    smooth: float = 1.0
     precision: str = "float16"
     pool_mb: int = DEFAULT_BYTES >> 20
     wrap: str = "wrap"
@@ -64,6 +68,7 @@ class Settings:
         choices = {
             "activation": ("relu", "leaky", "sine"),
             "offset_activation": ("relu", "leaky", "sine"),
+            "depth": ("heights", "network"),
             "inputs": tuple(INPUTS),
             "output": ("log", "relu", "mask"),
             "outputs": (3, 6),
@@ -79,7 +84,7 @@ class Settings:
             ("levels", 0, 16), ("size", 0, 1 << 14), ("features", 1, 8), ("coarse", 0, 8),
             ("light", 0, 8), ("offset", 0, 8), ("width", 1, 128), ("offset_width", 1, 128),
             ("batch", 0, 1 << 24), ("pool_mb", 1, 1 << 24), ("rate", 0, 1), ("texture_rate", 0, 1),
-            ("beta2", 0, 0.999999), ("decay", 0, 100), ("omega", 0, 1000), ("smooth", 0, 1),
+            ("beta2", 0, 0.999999), ("decay", 0, 100), ("omega", 0, 1000), ("smooth", 0, 8),
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"{name} = {getattr(self, name)}; expected {low} to {high}")

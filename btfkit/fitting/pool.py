@@ -7,9 +7,10 @@ seed and step alone, so a resumed run sees the same data.
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import final
 
 import numpy as np
@@ -41,6 +42,8 @@ class Pool:
         images: (k, h, w, c); NaN where not measured, as in the BTF.
         pairs: (k,) the pair that each image is of.
         masked: texels that are not measured, counted over what was decoded.
+        waits, waited_s: how often, and for how many seconds, a step stood until textures that
+            were due had been decoded.
 
     Raises:
         FitError: no texel of any pair is measured.
@@ -64,6 +67,7 @@ class Pool:
         self.images = self._filled(progress)
         if not np.isfinite(self.images).any():
             raise FitError("no texel of any texture is measured (all are NaN)")
+        self.waits, self.waited_s = 0, 0.0
         self._moved = 0
         self._worker = None if self.whole else ThreadPoolExecutor(1)
         self._coming: Future[NDArray[np.float32]] | None = None
@@ -79,10 +83,18 @@ class Pool:
             first = len(self.pairs) + self._moved
             coming = self._coming or self._worker.submit(self._decode, first)
             slots = np.arange(first, first + self._quota) % len(self.pairs)
-            self.images[slots] = coming.result()
+            self.images[slots] = self._awaited(coming)
             self.pairs[slots] = self._sequence(first, self._quota)
             self._moved += self._quota
             self._coming = self._worker.submit(self._decode, first + self._quota)
+
+    def _awaited(self, coming: Future[NDArray[np.float32]]) -> NDArray[np.float32]:
+        if not coming.done():
+            start = time.perf_counter()
+            wait([coming])
+            self.waits += 1
+            self.waited_s += time.perf_counter() - start
+        return coming.result()
 
     @property
     def _quota(self) -> int:

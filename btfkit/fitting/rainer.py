@@ -8,8 +8,8 @@ of a whitened texel: it is trained on one or several materials, and encodes othe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, final
 
@@ -33,7 +33,7 @@ from btfkit.materials.interpolation import header_of
 from btfkit.materials.rainer import RainerSpec
 
 # Texels encoded at once for the finished texture.
-_CHUNK = 4096
+_CHUNK = 512
 _HELD_PAIRS, _HELD_TEXELS = 24, 256
 
 
@@ -74,7 +74,12 @@ class Settings:
 
 
 class _Rainer(Trainable):
-    """What both have in common: they differ in encoder, whitening and data."""
+    """What both have in common: they differ in encoder, whitening and data.
+
+    Args:
+        btf: what the material is of. train, test: its pairs.
+        others: further BTFs that rainer20 learns from, beside those that a setting names.
+    """
 
     whitened: ClassVar[bool]
     latents: ClassVar[int]
@@ -89,16 +94,19 @@ class _Rainer(Trainable):
         settings: Mapping[str, str],
         generators: Generators,
         progress: Callable[[int, int], None] | None = None,
+        others: Sequence[BTF] = (),
     ) -> None:
         self.settings = s = parsed(Settings, self.model, settings)
-        if not self.whitened and (s.materials or s.encoder):
+        if not self.whitened and (s.materials or s.encoder or others):
             raise ValueError("materials and encoder are for rainer20: rainer19 knows one BTF only")
         btf = images_of(btf, self.model)
         _, h, w, c = btf.shape
         latents = s.latents or type(self).latents
         self.spec = RainerSpec((h, w), c, latents, self.whitened)
-        self._header, self._generators = header_of(btf), generators
-        sources = [(btf, train), *((b, np.arange(len(b))) for b in self._others(btf))]
+        self._generators = generators
+        others = self._others(btf, others)
+        sources = [(btf, train), *((b, np.arange(len(b))) for b in others)]
+        self._headers = [header_of(source) for source, _ in sources]
         share = (s.pool_mb << 20) // len(sources)
         self._data = [
             Samples(
@@ -122,8 +130,9 @@ class _Rainer(Trainable):
         self._steps, self._rate = 0, 1.0
         self._hold(btf, test)
 
-    def _others(self, btf: BTF) -> list[BTF]:
-        found = [io.open(name) for name in self.settings.materials.split(",") if name]
+    def _others(self, btf: BTF, given: Sequence[BTF]) -> list[BTF]:
+        named = [io.open(name) for name in self.settings.materials.split(",") if name]
+        found = [images_of(other, self.model) for other in (*given, *named)]
         for other in found:
             if other.channels != btf.channels:
                 raise FitError(f"channels {other.channels} beside {btf.channels}: they must agree")
@@ -199,8 +208,10 @@ class _Rainer(Trainable):
         error = torch.where(measured, predicted - wanted, 0.0).square()
         return float(error.sum() / measured.sum().clamp_min(1))
 
-    def material(self) -> evaluated.Rainer19 | evaluated.Rainer20:
-        data, (h, w) = self._data[0], self.spec.size
+    def material(self, which: int = 0) -> evaluated.Rainer19 | evaluated.Rainer20:
+        """The BTF itself, or another one that the networks learn from: its codes."""
+        data, header = self._data[which], self._headers[which]
+        h, w = header.grid
         with torch.no_grad():
             codes = torch.cat(
                 [
@@ -218,7 +229,7 @@ class _Rainer(Trainable):
         for name, texture in textures.items():
             bounded = texture.numpy().reshape(h, w, -1).clip(-limit, limit)
             weights[name] = bounded.astype(self.settings.precision)
-        return self.kind(self.spec, weights, self._header)
+        return self.kind(replace(self.spec, size=header.grid), weights, header)
 
     def training_arrays(self) -> dict[str, NDArray[Any]]:
         """The universal encoder; nothing where the encoder serves this BTF alone."""

@@ -75,7 +75,7 @@ def depths_plain(
     if layout.offset is None:
         return np.zeros(len(uv), texels.dtype)
     pyramid, network = layout.offset
-    psi = _bilinear(layout.textures(texels)[0][0], uv, wrap=layout.wrap)[:, : pyramid.channels]
+    psi = bilinear(layout.textures(texels)[0][0], uv, wrap=layout.wrap)[:, : pyramid.channels]
     known = _directions(view, view, None)
     return _run(network, layout.split(weights)[0], [psi], known)[:, 0] * layout.depth_scale
 
@@ -114,7 +114,7 @@ def crossing(
     surface = heights[..., None]
 
     def above(t: NDArray[Any]) -> NDArray[Any]:
-        return t - _bilinear(surface, uv + t[:, None] * along, wrap=wrap)[:, 0]
+        return t - bilinear(surface, uv + t[:, None] * along, wrap=wrap)[:, 0]
 
     t = np.full(len(uv), top, heights.dtype)
     gap = above(t)
@@ -181,12 +181,13 @@ def _between_levels(
         # The paper's eq. 3 has both weights 0 at whole levels; these sum to 1.
         weight = np.maximum(0, 1 - np.abs(at - s))
         rows = np.flatnonzero(weight)
-        value = _bilinear(texture, uv[rows], wrap=wrap)[:, : bank.channels]
+        value = bilinear(texture, uv[rows], wrap=wrap)[:, : bank.channels]
         found[rows] += weight[rows, None] * value
     return found
 
 
-def _bilinear(texture: NDArray[Any], uv: NDArray[Any], *, wrap: bool) -> NDArray[Any]:
+def bilinear(texture: NDArray[Any], uv: NDArray[Any], *, wrap: bool) -> NDArray[Any]:
+    """(b, k) of a texture (h, w, k) at uv (b, 2), tiling or clamped at its borders."""
     h, w, _ = texture.shape
     size = np.asarray([w, h], uv.dtype)
     if wrap:
