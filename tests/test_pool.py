@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+import time
+from concurrent.futures import wait
 
 import numpy as np
 import pytest
@@ -23,9 +25,11 @@ class Numbered(Textures):
     def __init__(self, n: int) -> None:
         self.shape = (n, 6, 5, 3)
         self.read: list[int] = []
+        self.late_s = 0.0
         self._lock = threading.Lock()
 
     def _read(self, index: int) -> np.ndarray:
+        time.sleep(self.late_s)
         with self._lock:
             self.read.append(index)
         return np.full(self.shape[1:], index, np.float32)
@@ -69,6 +73,42 @@ def test_what_a_pool_holds_is_a_function_of_seed_and_step(steps: list[int]) -> N
         held.append(found.pairs.tolist())
         np.testing.assert_array_equal(found.images[:, 0, 0, 0], found.pairs)
     assert held[0] == held[1]
+
+
+def test_no_step_waits_for_what_was_decoded_in_the_background() -> None:
+    found = Pool(numbered(60)[0], np.arange(60), seed=3, most_bytes=16 * ONE)
+    for step in range(0, 64 * 20, 64):
+        assert found._coming is not None
+        wait([found._coming])
+        found.at_step(step)
+    assert (found.waits, found.waited_s) == (0, 0)
+
+
+def test_a_step_that_has_to_wait_is_counted() -> None:
+    btf, textures = numbered(60)
+    found = Pool(btf, np.arange(60), seed=3, most_bytes=16 * ONE)
+    assert found._coming is not None
+    wait([found._coming])
+    textures.late_s = 0.05
+    found.at_step(64)
+    found.at_step(128)
+    assert found.waits == 1
+    # The decoder sleeps 50 ms; the step came for it at once, on whatever busy machine.
+    assert found.waited_s > 0.01
+
+
+@pytest.mark.parametrize(
+    ("held", "texels_a_step", "replaced"), [(200, 1 << 15, 80), (48, 1 << 15, 30), (200, 1, 20)]
+)
+def test_replacing_textures_costs_little_whatever_the_size_of_the_pool(
+    monkeypatch: pytest.MonkeyPatch, held: int, texels_a_step: int, replaced: int
+) -> None:
+    """In 640 steps one for every 8 of them, fewer of a small pool, fewer of large textures."""
+    monkeypatch.setattr(pool, "_TEXELS_A_STEP", texels_a_step)
+    found = Pool(numbered(400)[0], np.arange(400), seed=0, most_bytes=held * ONE)
+    first = found.pairs.copy()
+    found.at_step(640)
+    assert np.count_nonzero(found.pairs != first) == replaced
 
 
 def test_decoding_never_runs_far_ahead_of_who_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
