@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import ClassVar, final
 
 import numpy as np
@@ -27,7 +28,26 @@ from btfkit.native.neumip_layout import Array
 _SMOOTH_STEPS = 16
 _SMOOTH_HALVES = 5
 # Texels squared; what is left of a blur below it changes nothing.
-_LEAST_BLUR = 2e-3
+LEAST_BLUR = 2e-3
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A batch, and what is done with its gradient.
+
+    Attributes:
+        number: of the step, from 1. rates: of Adam, for the weights and for the texels.
+        dense: whether texels without a gradient move, too.
+        kept: factor on the weights afterwards. blur: of the finest textures afterwards, texels.
+    """
+
+    batch: Batch
+    number: int
+    rates: tuple[float, float]
+    dense: bool
+    kept: float
+    blur: float
 
 
 @final
@@ -76,33 +96,46 @@ class NeuMIP(Recipe):
     def _current(self) -> tuple[Array, Array]:
         return self._arrays["weights"], self._arrays["texels"]
 
-    def step(self, progress: float) -> float:
-        s, arrays = self.settings, self._arrays
+    def next_step(self, progress: float) -> Step:
+        """What the step at `progress` is; it counts as taken."""
+        s = self.settings
         batch = self._source.batch(self._steps, self._batch_size(progress))
         self._steps += 1
         self.queries += len(batch)
-        gradient = self._kernel_gradient if self._kernel else self._torch_gradient
-        loss = gradient(batch)
         factor = self._rate * min(1.0, (progress + 1e-3) / 0.02)
         factor *= 0.005 + 0.995 * (0.5 + 0.5 * math.cos(math.pi * progress))
         rates = (s.rate * factor, s.texture_rate * factor)
-        # A batch that touches few texels leaves the others, moments and all, as they are.
-        dense = 6 * len(batch) > self.layout.texels
+        smooth = s.smooth if self._steps % _SMOOTH_STEPS == 0 else 0.0
+        return Step(
+            batch,
+            self._steps,
+            rates,
+            # A batch that touches few texels leaves the others, moments and all, as they are.
+            dense=6 * len(batch) > self.layout.texels,
+            # Few directions say little about those between: small weights bend little.
+            kept=1 - rates[0] * self._decay,
+            blur=smooth * 2 ** (-_SMOOTH_HALVES * progress),
+        )
+
+    def step(self, progress: float) -> float:
+        s, arrays = self.settings, self._arrays
+        step = self.next_step(progress)
+        gradient = self._kernel_gradient if self._kernel else self._torch_gradient
+        loss = gradient(step.batch)
         parameters = [
             (arrays[n], arrays[f"{n}.first"], arrays[f"{n}.second"]) for n in ("weights", "texels")
         ]
         if self._kernel:
             self._kernel.adam(
-                parameters[0], parameters[1], lr=rates, step=self._steps,
-                betas=(0.9, s.beta2), dense=dense,
+                parameters[0], parameters[1], lr=step.rates, step=step.number,
+                betas=(0.9, s.beta2), dense=step.dense,
             )  # fmt: skip
         else:
-            for slots, rate, grown in zip(parameters, rates, self._gradients, strict=True):
-                adam_plain(slots, grown, rate, self._steps, (0.9, s.beta2), dense=dense)
-        # Few directions say little about those between: small weights bend little.
-        arrays["weights"] *= np.float32(1 - rates[0] * self._decay)
-        if s.smooth and self._steps % _SMOOTH_STEPS == 0:
-            self._smooth(s.smooth * 2 ** (-_SMOOTH_HALVES * progress))
+            for slots, rate, grown in zip(parameters, step.rates, self._gradients, strict=True):
+                adam_plain(slots, grown, rate, step.number, (0.9, s.beta2), dense=step.dense)
+        arrays["weights"] *= np.float32(step.kept)
+        if step.blur:
+            self._smooth(step.blur)
         # A depth that is no number is looked up at a border, with a finite loss: look at what
         # depths come from.
         good = np.isfinite(arrays["weights"]).all()
@@ -146,7 +179,7 @@ class NeuMIP(Recipe):
             finest.append(layout.surface(texels)[..., None])
         for texture in finest:
             variance = sigma**2
-            while variance > _LEAST_BLUR:
+            while variance > LEAST_BLUR:
                 for axis in (0, 1):
                     if texture.shape[axis] > 1:
                         share = np.float32(min(variance / 2, 0.25))
