@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from btfkit.bench import cells, kernels, run, tables, targets
+from btfkit.bench import cases, cells, kernels, run, targets
 from btfkit.bench.cases import asked, procedural, stored
+from btfkit.btf import BTF
 from btfkit.cli import btfkit
 from btfkit.cli.outcome import run as run_cli
 from btfkit.errors import BtfkitError
-from btfkit.io import store_write
+from btfkit.fitting import MODELS
+from btfkit.io import queryfile, store_write
 from btfkit.native import neumip as native
 
 compiled = pytest.mark.skipif(not native.available(), reason="the kernel was not built")
@@ -103,14 +107,170 @@ def test_unknown_names_are_refused_with_what_there_is(tmp_path):
 
 def test_the_verb_prints_one_json_object(tmp_path, capsys):
     arguments = ["bench", "print", "--model", "lambert", "--size", "16", "--directions", "2"]
+    (tmp_path / "b").mkdir()
+    # The tables of kernels have a test of their own, and take their time.
+    (tmp_path / "b" / "kernels.json").write_text('{"skips": [{"skip": "none", "ns": 1.0}]}')
     code = run_cli(btfkit, [*arguments, "-o", str(tmp_path / "b"), "--quick", "--json"])
     assert code == 0
     found = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert found["cells"][0]["model"] == "lambert"
     assert found["machine"]["threads"] >= 1
+    assert found["skips"] == [{"skip": "none", "ns": 1.0}]
+    assert "## What each skip saves" in (tmp_path / "b" / "bench.md").read_text()
     assert len(found["files"]) == 4
     assert run_cli(btfkit, ["bench", "jelly", "-o", str(tmp_path / "c")]) == 1
     assert "neither a file nor a material" in capsys.readouterr().err
+
+
+def test_cells_of_several_calls_are_told_together(tmp_path):
+    first = replace(TINY, models=("lambert",))
+    run.run(first, tmp_path)
+    found = run.run(
+        replace(TINY, models=("neumip",), budgets_cpu_s=(0.05,), materials=("print",)), tmp_path
+    )
+    assert {row["model"] for row in found["cells"]} == {"lambert", "neumip"}
+    assert found["cells"][0]["model"] == "lambert"
+    table = (tmp_path / "bench.md").read_text()
+    assert "| lambert |" in table
+    assert "| neumip size=8 |" in table
+    other = run.run(replace(first, materials=("cobbles",)), tmp_path)
+    assert [row["material"] for row in other["cells"]][:1] == ["cobbles"]
+    assert {row["material"] for row in other["cells"]} == {"cobbles", "print"}
+
+
+def test_cells_of_other_machines_and_of_older_versions_are_told(tmp_path):
+    found = run.run(replace(TINY, models=("lambert",), materials=("print", "cobbles")), tmp_path)
+    assert "Measured elsewhere" not in (tmp_path / "bench.md").read_text()
+    print_, cobbles = (tmp_path / "cells" / f"{n}_lambert_0.json" for n in ("print", "cobbles"))
+    old = json.loads(print_.read_text())
+    for key in ("machine", "ssim_srgb"):
+        del old[key]
+    print_.write_text(json.dumps(old))
+    far = json.loads(cobbles.read_text())
+    far["machine"]["processor"] = "Z80"
+    far["psnr"] = "inf"
+    cobbles.write_text(json.dumps(far))
+    again = run.run(replace(TINY, models=("lambert",)), tmp_path)
+    assert len(again["cells"]) == len(found["cells"]) == 2
+    table = (tmp_path / "bench.md").read_text()
+    assert "1 of 2 cells on an unnamed machine" in table
+    assert f"1 of 2 cells on Z80, {far['machine']['cores']} cores" in table
+    assert "| inf |" in table
+
+
+@pytest.mark.slow
+def test_processes_may_run_into_one_folder_at_a_time(tmp_path):
+    """Two materials at once: no cell is lost, and who ends last tells of all."""
+    command = [
+        sys.executable, "-c", "from btfkit.cli import main; main()", "bench", "--model", "lambert", "--model", "pca",
+        "--size", "16", "--directions", "3", "-o", str(tmp_path / "b"), "--quick", "--quiet",
+    ]  # fmt: skip
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "kernels.json").write_text('{"skips": []}')
+    both = [subprocess.Popen([*command, name]) for name in ("print", "cobbles")]
+    assert [process.wait() for process in both] == [0, 0]
+    assert not list(tmp_path.glob("b/**/.*"))
+    found = run.cells_in(tmp_path / "b", TINY)
+    assert [(row["material"], row["label"]) for row in found] == [
+        (material, label)
+        for material in ("print", "cobbles")
+        for label in ("lambert", *(f"pca rank={rank}" for rank in (1, 2, 4, 8, 16, 32)))
+    ]
+    written = json.loads((tmp_path / "b" / "bench.json").read_text())["cells"]
+    assert len(written) == 14
+
+
+def test_one_rainer20_is_trained_on_all_materials_and_answers_for_each(tmp_path):
+    profile = replace(
+        TINY, models=("rainer20",), materials=("print", "cobbles"), budgets_cpu_s=(0.05, 0.1)
+    )
+    found = run.run(profile, tmp_path)["cells"]
+    shared = [row for row in found if "shared" in row["settings"]]
+    assert [row["material"] for row in shared] == ["print", "cobbles"]
+    assert {row["label"] for row in shared} == {"rainer20 shared=print+cobbles"}
+    # One training: the same steps, the budget of both together, only the codes are apart.
+    assert shared[0]["cpu_seconds"] == shared[1]["cpu_seconds"] >= 0.2
+    assert shared[0]["steps"] == shared[1]["steps"]
+    assert shared[0]["mse"] != shared[1]["mse"]
+    assert len(found) == 6
+
+
+def test_shared_networks_fit_the_material_they_are_asked_for():
+    """Trained on two materials at once, the answer for each is nearer to it than to the other."""
+    from btfkit.materials.evaluation import errors_on_btf
+
+    bright, dark = (procedural(name, size=8, directions=4, seed=0) for name in ("print", "cobbles"))
+    trainable = cells._trainable(cells.Cell("print", "rainer20"), [bright, dark])
+    for step in range(150):
+        trainable.step(step / 150)
+    for which, (own, other) in enumerate(((bright, dark), (dark, bright))):
+        material = trainable.material(which)
+        mse = [errors_on_btf(material, case.train)["mse_log1p"] for case in (own, other)]
+        assert mse[0] < 0.5 * mse[1]
+
+
+def test_query_files_are_benchmarked_by_what_can_be_fitted_to_them(tmp_path):
+    case = procedural("print", size=16, directions=3, seed=0)
+    queryfile.write(case.queries, tmp_path / "q.npz")
+    held = asked(tmp_path / "q.npz", holdout=0.1, seed=0)
+    assert len(held.train) + len(held.queries) == len(case.queries)
+    assert len(held.queries) == round(0.1 * len(case.queries))
+    profile = replace(
+        TINY, materials=(), stores=(tmp_path / "q.npz",), models=tuple(MODELS),
+        budgets_cpu_s=(0.05,), holdout=0.1,
+    )  # fmt: skip
+    found = run.run(profile, tmp_path / "out")["cells"]
+    good = {row["model"] for row in found if "failed" not in row}
+    assert {"lambert", "neumip", "neumip-paper"} <= good
+    assert all("QuerySet" not in row["failed"] for row in found if "failed" in row)
+    for row in found:
+        assert row["material"] == "q.npz"
+        assert row["case"]["rows"] == len(held.train)
+        if "failed" not in row:
+            assert row["rows"] == len(held.queries)
+            assert [level["level"] for level in row["levels"]] == [0, 1, 2, 3, 4]
+        else:
+            assert row["failed"].startswith(f"{row['model']} ")
+    assert "needs the images of a BTF" in (tmp_path / "out" / "bench.md").read_text()
+
+
+def test_query_files_without_answers_or_without_usable_rows_are_refused(tmp_path):
+    case = procedural("print", size=16, directions=3, seed=0)
+    queryfile.write(replace(case.queries, rgb=None), tmp_path / "mute.npz")
+    with pytest.raises(ValueError, match=r"mute.npz has no answers \(rgb\)"):
+        asked(tmp_path / "mute.npz", holdout=0.1, seed=0)
+    below = replace(case.queries, view=case.queries.view * [1, 1, -1])
+    queryfile.write(below, tmp_path / "below.npz")
+    with pytest.raises(ValueError, match=r"held-out rows of .*below\.npz can be compared with"):
+        asked(tmp_path / "below.npz", holdout=0.1, seed=0)
+
+
+def test_materials_of_one_name_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="two materials are called 'print'"):
+        run.run(replace(TINY, stores=(tmp_path / "print.btf.zarr",)), tmp_path)
+
+
+@pytest.mark.parametrize(("shape", "wrap"), [((16, 16), "wrap"), ((12, 20), "clamp")])
+def test_small_pictures_hold_what_queries_find_at_their_places(shape, wrap):
+    rng = np.random.default_rng(0)
+    images = rng.random((1, *shape, 3)).astype(np.float32)
+    up = np.array([[0.0, 0.0, 1.0]])
+    queries, coarse = cases._levels(BTF(images, up, up, wrap=wrap))
+    assert [small.level for small in coarse] == list(range(1, max(shape).bit_length()))
+    for small in coarse:
+        at = np.full((*shape, 3), np.nan, np.float32)
+        row, col = (np.floor(small.uv[..., k] * shape[1 - k]).astype(int) for k in (1, 0))
+        at[row, col] = small.images[0]
+        counts = small.images.shape[1:3]
+        for side, stride in zip(counts, np.array(shape) / 2**small.level, strict=True):
+            assert max(np.floor(stride), 1) <= side <= np.floor(stride) + 1
+        same = queries.footprint == small.footprint
+        row, col = (np.floor(queries.uv[same, k] * shape[1 - k]).astype(int) for k in (1, 0))
+        both = np.isfinite(at[row, col]).all(axis=1)
+        # The coarsest picture is one texel, which half of the queries may miss.
+        assert both.any() or side == 1
+        # The same float32 sums, cut out in two ways.
+        np.testing.assert_array_equal(at[row, col][both], queries.rgb[same][both])
 
 
 def test_cells_are_told_apart_by_their_keys():

@@ -179,9 +179,7 @@ def _levels(btf: BTF) -> tuple[QuerySet, tuple[Coarse, ...]]:
     uv, light, view, blur, rgb = (
         np.concatenate(column).astype(np.float32) for column in zip(*parts, strict=True)
     )
-    queries = QuerySet(
-        uv, light, view, footprint=blur, rgb=rgb, size=(h, w), channels=btf.channels
-    )
+    queries = QuerySet(uv, light, view, footprint=blur, rgb=rgb, size=(h, w), channels=btf.channels)
     return queries, tuple(coarse)
 
 

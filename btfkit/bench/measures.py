@@ -21,7 +21,8 @@ from btfkit.native import neumip as kernels
 from btfkit.queries import QuerySet
 
 _LOOK_QUERIES = 8192
-_RATE_QUERIES = 1 << 17
+# Answers that are timed: as many as a fifth of a second allows.
+_RATE_QUERIES, _RATE_S = 1 << 17, 0.2
 
 
 def errors(material: Material, case: Case) -> dict[str, Any]:
@@ -85,7 +86,8 @@ def rate(material: Material, case: Case) -> dict[str, float | None]:
     start = time.perf_counter()
     material.evaluate(*(a[:part] for a in ask))
     # A model that takes microseconds a query is timed on fewer of them.
-    count = _RATE_QUERIES if time.perf_counter() - start < 0.1 else part
+    fitting = _RATE_S / max(time.perf_counter() - start, 1e-9)
+    count = int(np.clip(fitting, 1, _RATE_QUERIES // part)) * part
     walls, cpus = [], []
     for _ in range(3):
         start, cpu = time.perf_counter(), time.process_time()

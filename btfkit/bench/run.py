@@ -79,15 +79,24 @@ def run(profile: Profile, folder: Path, *, progress: Progress | None = None) -> 
     folder.mkdir(parents=True, exist_ok=True)
     _claim(folder, profile)
     _run_missing(profile, folder, progress)
-    rows = cells_in(folder, profile)
-    found = {
+    further = {
         "machine": machine(),
         "profile": json.loads(json.dumps(asdict(profile), default=str)),
-        "cells": rows,
         **_kernels(folder, profile),
-        "targets": targets.targets(rows),
     }
-    good = [row for row in rows if "failed" not in row]
+    rows: list[dict[str, Any]] | None = None
+    found: dict[str, Any] = {}
+    # Another process may have finished cells meanwhile; the last to write has seen them all.
+    while rows != (now := cells_in(folder, profile)):
+        rows = now
+        found = {**further, "cells": rows, "targets": targets.targets(rows)}
+        _tell(folder, found)
+    return found
+
+
+def _tell(folder: Path, found: Mapping[str, Any]) -> None:
+    """Plots, tables and JSON of everything."""
+    good = [row for row in found["cells"] if "failed" not in row]
     for name, draw in (
         ("rate-distortion.png", plots.rate_distortion),
         ("time-to-error.png", plots.time_to_error),
@@ -97,7 +106,6 @@ def run(profile: Profile, folder: Path, *, progress: Progress | None = None) -> 
     with whole(folder / "bench.md", force=True) as partial:
         partial.write_text(tables.markdown(found))
     _write(folder / "bench.json", found)
-    return found
 
 
 def cells_in(folder: Path, profile: Profile) -> list[dict[str, Any]]:

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from btfkit.btf import BTF
 from btfkit.fitting import augment, losses
 from btfkit.fitting.guides import Guide, Guides, Window, encode
+from btfkit.fitting.interpolation import images_of
 from btfkit.fitting.loop import Generators, Trainable, restore_tensors, tensors_of
 from btfkit.fitting.neubtf_data import Directions, HeldOut, first_latents, frontal_slice
 from btfkit.fitting.neubtf_settings import Settings
@@ -51,6 +52,7 @@ class NeuBTF(Trainable):
         progress: Any = None,
     ) -> None:
         self.settings = s = parsed(Settings, "neubtf", settings)
+        btf = images_of(btf, "neubtf")
         self._btf, self._generators = btf, generators
         _, h, w, c = btf.shape
         self.spec = NeuBTFSpec((h, w), c, s.latents, omega=s.omega, parallax=s.parallax)
