@@ -102,8 +102,10 @@ def skip_table(seconds: float = _SECONDS, *, size: int = 512) -> list[dict[str, 
     timed: dict[str, Callable[[], object]] = {
         "everything, mixed levels": lambda: kernel.evaluate(weights, texels, *mixed),
         "no offset stage": lambda: bare.evaluate(flat_weights, flat_texels, *mixed),
-        "level 0, footprints given": lambda: kernel.evaluate(weights, texels, *sharp[:3], at_zero),
-        "level 0, no footprints": lambda: kernel.evaluate(weights, texels, *sharp),
+        "one level, footprints given": lambda: kernel.evaluate(
+            weights, texels, *sharp[:3], at_zero
+        ),
+        "one level, no footprints": lambda: kernel.evaluate(weights, texels, *sharp),
         "16 lights a view, view stage kept": lambda: kernel.evaluate_lights(
             weights, texels, uv, lights, view
         ),

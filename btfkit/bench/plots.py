@@ -11,11 +11,13 @@ Row = Mapping[str, Any]
 
 
 def rate_distortion(rows: Sequence[Row], path: Path) -> None:
-    """log1p PSNR of every model of every material against its bytes; the longest budgets."""
-    longest = _longest(rows)
+    """log1p PSNR of every model of every material against its bytes; the longest budgets.
+
+    Sizes of a closed form are one curve; variants of a trained model are points of their own.
+    """
     _draw(
-        longest, path, x="bytes", x_label="bytes", title="Error against size",
-        joined=lambda row: row["model"],
+        _longest(rows), path, x="bytes", x_label="bytes", title="Error against size",
+        curves=lambda row: row["budget_cpu_s"] is None,
     )  # fmt: skip
 
 
@@ -24,7 +26,8 @@ def time_to_error(rows: Sequence[Row], path: Path) -> None:
     plain = [row for row in rows if not row["settings"] or row["budget_cpu_s"] is None]
     _draw(
         plain, path, x="cpu_seconds", x_label="CPU seconds of training",
-        title="Error against time", joined=lambda row: row["model"], courses=True,
+        title="Error against time", curves=lambda row: row["budget_cpu_s"] is not None,
+        courses=True,
     )  # fmt: skip
 
 
@@ -44,9 +47,10 @@ def _draw(
     x: str,
     x_label: str,
     title: str,
-    joined: Any,
+    curves: Any,
     courses: bool = False,
 ) -> None:
+    """One panel a material; points of a model are joined where `curves` says so of its rows."""
     from matplotlib.figure import Figure
 
     materials = sorted({row["material"] for row in rows})
@@ -55,26 +59,30 @@ def _draw(
     marks = "osD^v<>Phd"
     figure = Figure(figsize=(4.6 * max(len(materials), 1), 4.8), layout="constrained")
     axes = figure.subplots(1, max(len(materials), 1), squeeze=False)[0]
+    entries: dict[str, Any] = {}
     for axis, material in zip(axes, materials, strict=False):
-        here = sorted((r for r in rows if r["material"] == material), key=joined)
-        for model, group in groupby(here, key=joined):
-            points = sorted((float(r[x]), float(r["psnr_log1p"])) for r in group)
+        here = sorted((r for r in rows if r["material"] == material), key=lambda r: r["model"])
+        for model, group in groupby(here, key=lambda row: row["model"]):
+            own = list(group)
+            points = sorted((float(r[x]), float(r["psnr_log1p"])) for r in own)
             index = models.index(model)
-            style = {"color": f"C{index}", "marker": marks[index % len(marks)]}
-            # Sizes of a closed form are no course in time.
-            timed = any(row["budget_cpu_s"] is not None for row in rows if row["model"] == model)
-            line = "-" if len(points) > 1 and (timed or not courses) else ""
-            axis.plot(*zip(*points, strict=True), line, label=model, **style)
+            (entries[model],) = axis.plot(
+                *zip(*points, strict=True), color=f"C{index}", marker=marks[index % len(marks)],
+                linestyle="-" if curves(own[0]) else "none",
+            )  # fmt: skip
             if courses:
-                _course([r for r in here if joined(r) == model], axis, f"C{index}")
+                _course(own, axis, f"C{index}")
         axis.set_xscale("log")
         axis.set_title(material)
         axis.set_xlabel(x_label)
         axis.grid(visible=True, which="both", alpha=0.3)
-    if len(axes):
-        axes[0].set_ylabel("PSNR of log(1 + x), dB, held-out pictures")
-        handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 5) or 1)
+    if entries:
+        axes[0].set_ylabel("PSNR of log(1 + x), dB, held out")
+        names = sorted(entries)
+        figure.legend(
+            [entries[name] for name in names], names, loc="outside lower center",
+            ncols=min(len(names), 5),
+        )  # fmt: skip
     figure.suptitle(title)
     figure.savefig(path, dpi=110)
 
@@ -83,5 +91,5 @@ def _course(rows: Sequence[Row], axis: Any, colour: str) -> None:
     """The looks while the longest run of one model went on, thin."""
     longest = max(rows, key=lambda row: row["budget_cpu_s"] or 0)
     if longest["curve"]:
-        points = [(look["cpu_s"], look["psnr_log1p"]) for look in longest["curve"]]
+        points = [(look["cpu_s"], float(look["psnr_log1p"])) for look in longest["curve"]]
         axis.plot(*zip(*points, strict=True), ":", color=colour, linewidth=1)

@@ -38,8 +38,10 @@ def bench_verb(
 ) -> Outcome:
     """Fit models to materials within budgets, and write what each cost and how far off it is.
 
-    NAMES: materials of `btfkit synth --list`, or stores and whatever else `ingest` reads. Writes
-    bench.json, bench.md and two plots. What a former run of the same folder finished is kept.
+    NAMES: materials of `btfkit synth --list`, or stores, query files and whatever else `ingest`
+    reads. Writes bench.json, bench.md and two plots of all that the folder holds: what former
+    calls finished is kept and told with the rest, so that models, budgets and materials may be
+    run one after the other, or by several processes at a time.
     """
     from btfkit.bench.run import QUICK, Profile, run
     from btfkit.bench.tables import generic
