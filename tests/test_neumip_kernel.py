@@ -29,15 +29,15 @@ def pyramid(size, levels, channels=7, **moves):
 
 def layout(
     activation="relu", output="log", *, offset=True, banks=None, levels=1, width=25, channels=3,
-    size=(37, 50), wrap=True, directions=("lx", "ly", "vx", "vy"), heights=None,
+    size=(37, 50), wrap=True, directions=("lx", "ly", "vx", "vy"), heights=None, frames=0,
 ):  # fmt: skip
     banks = banks or (pyramid(size, levels),)
     outputs = channels * (2 if output == "mask" else 1)
-    inputs = sum(b.channels for b in banks) + len(directions)
+    inputs = sum(b.channels for b in banks) + 2 * frames + len(directions)
     decoder = Network((inputs, width, width, width, outputs), directions, activation)
     stage = (pyramid(size, 1), Network((9, width, width, width, 1), ("vx", "vy"), activation))
     return Layout(
-        decoder, banks, stage if offset and not heights else None, heights, channels=channels, output=output,
+        decoder, banks, stage if offset and not heights else None, heights, frames, channels=channels, output=output,
         aspect=1.35, depth_scale=0.02, wrap=wrap,
     )  # fmt: skip
 
@@ -60,7 +60,8 @@ CASES = {
     "nine channels": layout("relu", channels=9, levels=3, width=31),
     "one texel": layout("sine", size=(1, 1)),
     "one row": layout("sine", size=(1, 13), levels=3),
-    "heights": layout("leaky", levels=6, heights=(37, 50), directions=ALL),
+    "heights, frames": layout("leaky", levels=6, heights=(37, 50), directions=ALL, frames=2),
+    "a frame": layout("sine", frames=1, levels=3),
     "heights, three banks, clamped": layout(banks=THREE_BANKS, wrap=False, heights=(11, 14)),
     "one height": layout(heights=(1, 1)),
 }

@@ -66,6 +66,7 @@ class NeuMIP(Recipe):
             coarse=s.coarse,
             light=s.light if s.offset else 0,
             offset=s.offset,
+            frames=min(s.frames, s.features // 3),
             heights=bool(s.offset) and s.depth == "heights",
             hidden=(s.width,) * 3,
             offset_hidden=(s.offset_width,) * 3,

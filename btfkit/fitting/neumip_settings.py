@@ -19,6 +19,7 @@ class Settings:
         features, coarse, light, offset: channels, as in `NeuMIPSpec`.
         depth: "heights" finds ray depths in a texture of heights, "network" in the offset texture
             and network as published; `offset` 0 leaves either out.
+        frames: vectors among the features, three each, that half vector and light are projected on.
         width, offset_width: of the three hidden layers of each network.
         activation, offset_activation: "relu", "leaky" or "sine".
         inputs: "xy" as published, "half" with the half vector beside it, "full" with all cosines,
@@ -41,6 +42,7 @@ class Settings:
     levels: int = 0
     size: int = 0
     features: int = 7
+    frames: int = 2
     coarse: int = 0
     light: int = 0
     offset: int = 7
@@ -81,7 +83,7 @@ class Settings:
                 known = ", ".join(map(str, allowed))
                 raise ValueError(f"{name} = {getattr(self, name)!r}; expected one of {known}")
         for name, low, high in (
-            ("levels", 0, 16), ("size", 0, 1 << 14), ("features", 1, 8), ("coarse", 0, 8),
+            ("levels", 0, 16), ("size", 0, 1 << 14), ("features", 1, 8), ("frames", 0, 2), ("coarse", 0, 8),
             ("light", 0, 8), ("offset", 0, 8), ("width", 1, 128), ("offset_width", 1, 128),
             ("batch", 0, 1 << 24), ("pool_mb", 1, 1 << 24), ("rate", 0, 1), ("texture_rate", 0, 1),
             ("beta2", 0, 0.999999), ("decay", 0, 100), ("omega", 0, 1000), ("smooth", 0, 8),

@@ -41,6 +41,10 @@ def forward(
     for bank, levels in zip(layout.banks, textures, strict=True):
         move = bank.view * step(view, layout) - bank.light * step(light, layout)
         features.append(_between_levels(bank, levels, uv + depth * move, known, wrap=layout.wrap))
+    half = torch.stack([known[name] for name in ("hx", "hy", "hz")], dim=1)
+    for k in range(layout.frames):
+        axis = features[0][:, 3 * k : 3 * k + 3]
+        features += [(axis * direction).sum(1, keepdim=True) for direction in (half, light)]
     return run(layout.decoder, decoder_weights, features, known)
 
 

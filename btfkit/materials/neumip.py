@@ -39,6 +39,8 @@ class NeuMIPSpec:
         offset: channels of the offset texture, 1 to 8; 0 for no offset network.
         heights: whether the ray depth is where the view ray meets a texture of heights; then
             there is no offset network, whatever `offset` says.
+        frames: vectors among the pyramid's channels, three each, whose products with the half
+            vector and the light the decoder takes too: 0, 1 or 2.
         hidden, offset_hidden: widths of the hidden layers.
         activation, offset_activation: of the hidden layers.
         directions: what the decoder takes beside the features.
@@ -65,6 +67,7 @@ class NeuMIPSpec:
     channels: int = 3
     precision: Precision = "float32"
     heights: bool = False
+    frames: int = 0
 
     def layout(self, header: Header) -> Layout:
         """The model as its kernels see it."""
@@ -78,7 +81,7 @@ class NeuMIPSpec:
         if self.light:
             banks.append(Pyramid((self.size,), self.light, light=1.0, shift=shift))
         outputs = self.channels * (2 if self.output in ("mask", "released") else 1)
-        inputs = sum(bank.channels for bank in banks) + len(self.directions)
+        inputs = sum(bank.channels for bank in banks) + 2 * self.frames + len(self.directions)
         decoder = Network((inputs, *self.hidden, outputs), self.directions, self.activation)
         offset = None
         if self.offset and not self.heights:
@@ -93,6 +96,7 @@ class NeuMIPSpec:
             tuple(banks),
             offset,
             self.size if self.heights else None,
+            self.frames,
             channels=outputs if released else self.channels,
             output=output,
             aspect=header.aspect,

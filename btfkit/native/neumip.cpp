@@ -155,7 +155,7 @@ class Zeros {
 // A model's layout, and the scratch that its training keeps between steps.
 class Model {
   public:
-    Model(bool wrap, float aspect, float depth_scale, int output, int channels,
+    Model(bool wrap, float aspect, float depth_scale, int output, int channels, int frames,
           const std::vector<std::vector<int64_t>>& textures,
           const std::vector<std::vector<double>>& banks, bool offset,
           const std::vector<int>& heights,
@@ -168,6 +168,7 @@ class Model {
         p.depth_scale = depth_scale;
         p.output = output;
         p.channels = channels;
+        p.frames = frames;
         for (const auto& t : textures) {
             require(t.size() == 3, "a texture is (h, w, start)");
             p.textures.push_back({int(t[0]), int(t[1]), t[2]});
@@ -456,7 +457,7 @@ void draw(In<T> images, In<float> light, In<float> view, In<int32_t> phase, int 
 
 NB_MODULE(_neumip, m) {
     nb::class_<Model>(m, "Model")
-        .def(nb::init<bool, float, float, int, int, const std::vector<std::vector<int64_t>>&,
+        .def(nb::init<bool, float, float, int, int, int, const std::vector<std::vector<int64_t>>&,
                       const std::vector<std::vector<double>>&, bool, const std::vector<int>&,
                       const std::vector<int>&, const std::vector<int>&, int, const std::vector<int>&,
                       const std::vector<int>&, int>())

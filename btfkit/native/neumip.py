@@ -55,6 +55,7 @@ class Kernel:
             layout.depth_scale,
             OUTPUTS.index(layout.output),
             layout.channels,
+            layout.frames,
             textures,
             banks,
             layout.offset is not None,

@@ -88,6 +88,8 @@ class Layout:
         offset: the texture and network of the ray depth; None without them.
         heights: (h, w) of a texture of heights, whose first crossing with the view ray gives the
             ray depth in place of the network; None without it.
+        frames: vectors among the first bank's features, three numbers each: the decoder takes
+            the products of each with the half vector and with the light, after the features.
         channels: of the answer. output: "log" as it comes, "relu" with negative numbers cut,
             "mask" with the first half times 0.1 + sigmoid(second half).
         aspect: tile width / tile height.
@@ -99,6 +101,7 @@ class Layout:
     banks: tuple[Pyramid, ...]
     offset: tuple[Pyramid, Network] | None = None
     heights: tuple[int, int] | None = None
+    frames: int = 0
     channels: int = 3
     output: Output = "log"
     aspect: float = 1.0

@@ -46,6 +46,10 @@ def evaluate_plain(
             move = bank.view * step(view, layout) - bank.light * step(light, layout)
             moved = uv + depth[:, None] * move
         parts.append(_between_levels(bank, levels, moved, known["level"] * 8, wrap=layout.wrap))
+    half = np.stack([known[name] for name in ("hx", "hy", "hz")], axis=1)
+    for k in range(layout.frames):
+        axis = parts[0][:, 3 * k : 3 * k + 3]
+        parts += [(axis * direction).sum(axis=1, keepdims=True) for direction in (half, light)]
     z = _run(layout.decoder, layout.split(weights)[1], parts, known)
     if raw:
         return z

@@ -51,6 +51,8 @@ struct Plan {
     bool wrap = true, offset = false;
     float aspect = 1, depth_scale = 1;
     int output = kLog, channels = 3;
+    int frames = 0;  // vectors among the first features: the decoder takes their products with
+                     // the half vector and with the light
     std::vector<Texture> textures;
     Bank offset_bank{};
     Texture heights{0, 0, 0};  // one float a texel, first of all; h = 0 where there are none
@@ -63,6 +65,12 @@ struct Plan {
         for (const auto& t : textures) n = std::max(n, t.start + int64_t(t.h) * t.w);
         return n;
     }
+    int features() const {
+        int n = 0;
+        for (const auto& b : banks) n += b.channels;
+        return n;
+    }
+    bool needs_half() const { return frames > 0 || decoder.needs_half(); }
     bool depth() const { return offset || heights.h > 0; }
     bool needs_light() const {
         for (const auto& b : banks)
@@ -99,13 +107,11 @@ inline void check(const Plan& plan) {
     };
     require(!(plan.offset && plan.heights.h), "depths from a network or from heights, not both");
     require(int64_t(plan.heights.h) * plan.heights.w < (int64_t(1) << 30), "2^30 heights or more");
-    int features = 0;
-    for (const auto& b : plan.banks) {
-        bank(b);
-        features += b.channels;
-    }
+    for (const auto& b : plan.banks) bank(b);
+    require(plan.frames >= 0 && 3 * plan.frames <= plan.banks[0].channels,
+            "a frame takes three channels of the first bank");
     check(plan.decoder);
-    require(plan.decoder.features() == features, "the decoder's inputs do not fit its banks");
+    require(plan.decoder.features() == plan.features() + 2 * plan.frames, "the decoder's inputs do not fit its banks");
     const int raw = plan.output == kLogMask ? 2 * plan.channels : plan.channels;
     require(plan.channels >= 1 && plan.decoder.widths.back() == raw,
             "the decoder's outputs do not fit the channels");

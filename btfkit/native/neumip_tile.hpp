@@ -118,7 +118,7 @@ struct Tile {
             for (int c = 0; c < 3; ++c) std::fill(direction[c], direction[c] + n, light[c]);
         else vectors(direction, light, valid, n);
         if (plan.depth() && plan.needs_light()) step(direction, in[kLu], in[kLv], n);
-        if (!plan.decoder.needs_half()) return;
+        if (!plan.needs_half()) return;
         for (int i = 0; i < n; i += L) {
             F h[3];
             for (int c = 0; c < 3; ++c) h[c] = load(direction[c] + i) + load(direction[3 + c] + i);
@@ -237,6 +237,36 @@ struct Tile {
         }
     }
 
+    // Products of the frames with the half vector and the light, after the features.
+    MEMBER void put_frames(int from, int n) {
+        Rows& x = decoder_trace.x[0];
+        const int first = plan.features();
+        for (int k = 0; k < plan.frames; ++k)
+            for (int i = from; i < from + n; i += L) {
+                F half = all(0.f), light = all(0.f);
+                for (int c = 0; c < 3; ++c) {
+                    const F part = load(x[3 * k + c] + i);
+                    half += part * load(direction[6 + c] + i);
+                    light += part * load(direction[c] + i);
+                }
+                store(x[first + 2 * k] + i, half);
+                store(x[first + 2 * k + 1] + i, light);
+            }
+    }
+
+    // The gradient of the features, rows of d, gets what comes through the frames' products.
+    MEMBER void back_through_frames(float* d, int n) {
+        const float* product = d + plan.features() * kStride;
+        for (int k = 0; k < plan.frames; ++k)
+            for (int c = 0; c < 3; ++c) {
+                float* row = d + (3 * k + c) * kStride;
+                const float *half = product + 2 * k * kStride, *light = half + kStride;
+                for (int i = 0; i < n; i += L)
+                    store(row + i, load(row + i) + load(half + i) * load(direction[6 + c] + i) +
+                                       load(light + i) * load(direction[c] + i));
+            }
+    }
+
     // log(1 + rgb) as the model sees it, in the decoder's last rows; a mask is multiplied in.
     MEMBER F answer(int c, int i) {
         Rows& z = decoder_trace.x.back();
@@ -270,6 +300,7 @@ struct Tile {
                 fetch_features<false>(*this, half, n, true);
             }
             if (!fetched) fetch_features<false>(*this, half, n, false);
+            put_frames(from, size);
             run_forward(decoder, decoder_trace, false, from, size, &feed);
             if (half == 0 && plan.offset && ahead != now) feed.add(offset_list[ahead], texels);
         }
@@ -353,13 +384,15 @@ struct Tile {
         wish(1, texels);
         for (int half = 0; half < 2; ++half) {
             fetch_features<true>(*this, half, n, false);
+            put_frames(half_from(half), half_size(half, n));
             run_forward(decoder, decoder_trace, true, half_from(half), half_size(half, n), &feed);
             if (half == 0) wish(0, g.texels);
         }
         judge(b, at, valid, n, loss, scale, g);
         wish(1, g.texels);
         if (plan.offset) feed.add(offset_list[now], g.texels);
-        const float* d = run_backward(decoder, decoder_trace, n, &feed);
+        float* d = run_backward(decoder, decoder_trace, n, &feed);
+        back_through_frames(d, n);
         float* depth = plan.offset ? offset_trace.d0.base : plan.heights.h ? in[kSlope] : nullptr;
         if (depth) std::fill(depth, depth + n, 0.f);
         for (size_t k = 0; k < plan.banks.size(); ++k) {
