@@ -97,7 +97,9 @@ class Packing:
         self.size = banks + _TILE * _WIDEST * len(counts)
         for a, b in zip(network.widths[1:-2], network.widths[2:-1], strict=True):
             place = self.size + torch.arange(b)
-            self._layer(torch.arange(a) * _WIDEST, place, self.size + 32 * _WIDEST + torch.arange(b))
+            self._layer(
+                torch.arange(a) * _WIDEST, place, self.size + 32 * _WIDEST + torch.arange(b)
+            )
             self.size += (_WIDEST + 1) * _WIDEST
         parts = [
             self.size + (_WIDEST + 1) * columns * k + torch.arange(head)
@@ -228,7 +230,8 @@ def _some(part: Tensor | None, other: Tensor) -> Tensor:
 
 def _tables(layout: Layout) -> tuple[Tensor, Tensor]:
     """(pyramids, 8) view, light, shift, levels, first texture; (textures, 3) h, w, first texel."""
-    banks, textures = [], []
+    banks: list[list[float]] = []
+    textures: list[tuple[int, int, int]] = []
     at = layout.texels - sum(pyramid.texels for pyramid in layout.pyramids)
     for pyramid in layout.pyramids:
         numbers = (pyramid.view, pyramid.light, pyramid.shift, len(pyramid.sizes), len(textures))
@@ -240,9 +243,13 @@ def _tables(layout: Layout) -> tuple[Tensor, Tensor]:
 
 
 def _config(layout: Layout, packing: Packing, matrix: Matrix, block: int) -> dict[str, Any]:
+    import triton
     import triton.language as tl
 
     kinds = {"fp16": tl.float16, "bf16": tl.bfloat16}
+    exact = "tf32" if matrix == "tf32" else "ieee"
+    if matrix == "bf16" and triton.knobs.runtime.interpret:
+        exact = "rounded"
     stage = "heights" if layout.heights else "network" if layout.offset else "none"
     return {
         "stage": stage,
@@ -259,6 +266,6 @@ def _config(layout: Layout, packing: Packing, matrix: Matrix, block: int) -> dic
         "steepest": STEEPEST,
         "flattest": FLATTEST,
         "kind": kinds.get(matrix, tl.float32),
-        "exact": "tf32" if matrix == "tf32" else "ieee",
+        "exact": exact,
         "block": block,
     }
