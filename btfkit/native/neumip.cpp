@@ -10,11 +10,8 @@
 #include <cstdlib>
 #include <cstring>
 #include <ctime>
-#include <exception>
-#include <functional>
 #include <memory>
 #include <string>
-#include <thread>
 #include <vector>
 
 #if defined(__x86_64__)
@@ -24,7 +21,10 @@
 #include <sys/mman.h>
 #endif
 
+#include "arrays.hpp"
+#include "neumip_draw.hpp"
 #include "neumip_plan.hpp"
+#include "spread.hpp"
 
 #define NEUMIP_KEEP(x) asm volatile("" : "+r,m"(x) : : )
 #if defined(__x86_64__) && defined(__GNUC__)
@@ -33,10 +33,7 @@
 #define NEUMIP_SPACE avx2
 #define NEUMIP_LANES 8
 #define NEUMIP_TARGET __attribute__((target("avx2,fma")))
-#include "neumip_kernel.hpp"
-#include "neumip_lookup.hpp"
-#include "neumip_march.hpp"
-#include "neumip_tile.hpp"
+#include "neumip_variant.hpp"
 #undef NEUMIP_SPACE
 #undef NEUMIP_LANES
 #undef NEUMIP_TARGET
@@ -44,10 +41,7 @@
 #define NEUMIP_LANES 16
 #define NEUMIP_TARGET \
     __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx2,fma,prefer-vector-width=512")))
-#include "neumip_kernel.hpp"
-#include "neumip_lookup.hpp"
-#include "neumip_march.hpp"
-#include "neumip_tile.hpp"
+#include "neumip_variant.hpp"
 #undef NEUMIP_SPACE
 #undef NEUMIP_LANES
 #undef NEUMIP_TARGET
@@ -59,20 +53,12 @@
 #define NEUMIP_SPACE baseline
 #define NEUMIP_LANES 4
 #define NEUMIP_TARGET
-#include "neumip_kernel.hpp"
-#include "neumip_lookup.hpp"
-#include "neumip_march.hpp"
-#include "neumip_tile.hpp"
+#include "neumip_variant.hpp"
 
 namespace nb = nanobind;
 using namespace neumip;
 
 namespace {
-
-template <class T>
-using In = nb::ndarray<const T, nb::c_contig, nb::device::cpu>;
-template <class T>
-using Out = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
 
 struct Variant {
     const char* name;
@@ -106,25 +92,6 @@ Variant variant(const std::string& name) {
     for (const auto& v : known)
         if (name == v.name) return v;
     throw std::invalid_argument("this processor has no variant '" + name + "'");
-}
-
-// work(part, from, to) on `threads` equal runs of `size`, cut at multiples of `grain`.
-void spread(int64_t size, int64_t grain, int threads,
-            const std::function<void(int, int64_t, int64_t)>& work) {
-    const int64_t grains = (size + grain - 1) / grain;
-    auto cut = [&](int part) { return std::min(size, grains * part / threads * grain); };
-    std::vector<std::thread> others;
-    std::exception_ptr failure;
-    for (int part = 1; part < threads; ++part)
-        if (cut(part) < cut(part + 1))
-            others.emplace_back([&, part] { work(part, cut(part), cut(part + 1)); });
-    try {
-        if (cut(0) < cut(1)) work(0, cut(0), cut(1));
-    } catch (...) {
-        failure = std::current_exception();
-    }
-    for (auto& thread : others) thread.join();
-    if (failure) std::rethrow_exception(failure);
 }
 
 // Zeros that begin on a huge page: a texel never lies across two cache lines, and random texels
@@ -371,87 +338,6 @@ class Model {
     std::vector<Zeros> texels_;
     std::vector<std::vector<uint8_t>> touched_;
 };
-
-float from_half(uint16_t h) {
-    const uint32_t sign = uint32_t(h & 0x8000) << 16, rest = h & 0x7fff;
-    // Exponents move by 112; the product puts subnormals right, the largest exponent is special.
-    float f;
-    const uint32_t bits = rest << 13;
-    std::memcpy(&f, &bits, 4);
-    f *= 5.192296858534828e33f;  // 2^112
-    uint32_t out;
-    std::memcpy(&out, &f, 4);
-    if (rest >= 0x7c00) out = 0x7f800000 | bits;
-    out |= sign;
-    std::memcpy(&f, &out, 4);
-    return f;
-}
-
-uint64_t scrambled(uint64_t x) {  // splitmix64
-    x += 0x9e3779b97f4a7c15u;
-    x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9u;
-    x = (x ^ (x >> 27)) * 0x94d049bb133111ebu;
-    return x ^ (x >> 31);
-}
-
-// Random texels of random images: images (k, h, w, c) hold every `stride`-th row and column of
-// their image, from `phase` (k, 2) on, of a grid (rows, cols). Where texel > 0, light and view are
-// positions above the centre of the sample, and texel the edge of one of the grid.
-template <class T>
-void draw(In<T> images, In<float> light, In<float> view, In<int32_t> phase, int stride, int rows,
-          int cols, float texel_light, float texel_view, uint64_t seed, Out<float> uv,
-          Out<float> lights, Out<float> views, Out<float> rgb, Out<int32_t> slots, int threads) {
-    require(images.ndim() == 4 && images.size() > 0, "images are (k, h, w, c)");
-    const uint64_t k = images.shape(0), h = images.shape(1), w = images.shape(2);
-    const size_t c = images.shape(3), b = uv.size() / 2;
-    require(light.size() == 3 * k && view.size() == 3 * k && phase.size() == 2 * k, "a row an image");
-    require(lights.size() == 3 * b && views.size() == 3 * b && rgb.size() == c * b &&
-                slots.size() == b, "sizes of the batch");
-    constexpr int64_t block = 64;
-    nb::gil_scoped_release release;
-    spread(int64_t(b), block, int(std::clamp<size_t>(b / 4096, 1, threads)),
-           [&](int, int64_t from, int64_t to) {
-        const T* at[block];
-        int32_t slot[block], row[block], col[block];
-        for (int64_t start = from; start < to; start += block) {
-            const int n = int(std::min(block, to - start));
-            for (int i = 0; i < n; ++i) {
-                const uint64_t r = scrambled(seed + uint64_t(start + i)), q = scrambled(r);
-                slot[i] = int32_t(((r >> 32) * k) >> 32);
-                const uint64_t t = ((q >> 32) * (h * w)) >> 32;
-                row[i] = int32_t(t / w);
-                col[i] = int32_t(t % w);
-                at[i] = images.data() + (uint64_t(slot[i]) * h * w + t) * c;
-                __builtin_prefetch(at[i]);
-            }
-            for (int i = 0; i < n; ++i) {
-                const int64_t o = start + i;
-                const int s = slot[i];
-                const float y = float(row[i] * stride + phase.data()[2 * s]) + 0.5f;
-                const float x = float(col[i] * stride + phase.data()[2 * s + 1]) + 0.5f;
-                slots.data()[o] = s;
-                uv.data()[2 * o] = x / float(cols);
-                uv.data()[2 * o + 1] = y / float(rows);
-                auto direction = [&](const float* from_table, float texel, float* out) {
-                    float d[3] = {from_table[0], from_table[1], from_table[2]};
-                    if (texel > 0) {
-                        d[0] -= (x - float(cols) / 2) * texel;
-                        d[1] += (y - float(rows) / 2) * texel;
-                        const float size = std::sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
-                        for (float& part : d) part /= size;
-                    }
-                    for (int j = 0; j < 3; ++j) out[j] = d[j];
-                };
-                direction(light.data() + 3 * s, texel_light, lights.data() + 3 * o);
-                direction(view.data() + 3 * s, texel_view, views.data() + 3 * o);
-                for (size_t j = 0; j < c; ++j) {
-                    if constexpr (sizeof(T) == 2) rgb.data()[o * c + j] = from_half(at[i][j]);
-                    else rgb.data()[o * c + j] = at[i][j];
-                }
-            }
-        }
-    });
-}
 
 }  // namespace
 
