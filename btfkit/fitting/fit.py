@@ -41,7 +41,8 @@ class FitReport:
         steps, queries: taken and seen.
         parameters: weights but textures. bytes: of all arrays that answering needs.
         curve: (seconds, step, score) at every look at the held-out data.
-        choice: why `auto` took this model and these parts.
+        choice: why `auto` took this model and these parts, and why a GPU is not used.
+        device: what it was trained on.
         interrupted: whether the user ended it early.
     """
 
@@ -59,6 +60,7 @@ class FitReport:
     interrupted: bool = False
     out: str | None = None
     settings: Mapping[str, str] = field(default_factory=dict)
+    device: str = "cpu"
 
     def as_dict(self) -> dict[str, Any]:
         """The report as JSON types; errors stand at the top level under their own keys."""
@@ -99,7 +101,7 @@ def fit(
         budget_s: wall time of the training alone, seconds; `steps` takes its place where given.
         holdout: share of direction pairs (of rows, for queries) kept for the test, 0 to 1.
         seed: of all randomness.
-        device: "auto", "cpu" or "cuda".
+        device: "auto", "cpu" or "cuda"; auto is CUDA where there is one and the model can.
         out: model file to write, with OUT.report.json beside it; None writes nothing.
         resume: go on with the interrupted fit that left OUT.state.
         settings: the model's own, as text.
@@ -121,11 +123,15 @@ def fit(
         function = _load(CLOSED_FORM[chosen])
         material: Material = function(source.subset(train), settings=given, progress=progress)
         run = _Ran(time.perf_counter() - start, time.process_time() - cpu, 1, _samples(source))
+        if device == "cuda":
+            choice = (*choice, _on_cpu(chosen))
     else:
         material, run = _trained(
             source, chosen, train, test, given, seed, device,
             _Plan(None if steps is not None else budget_s, steps, final, resume), progress,
         )  # fmt: skip
+        if run.device == "cpu" and device != "cpu" and _gpu():
+            choice = (*choice, _on_cpu(chosen))
     header = replace(
         material.header, provenance=_provenance(source, seed, holdout, given, run), steps=run.steps
     )
@@ -167,6 +173,7 @@ class _Ran:
     masked: int = 0
     interrupted: bool = False
     training: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    device: str = "cpu"
 
 
 @final
@@ -194,13 +201,16 @@ def _trained(
     from btfkit import native
     from btfkit.fitting import loop
 
-    if device == "cuda" and not torch.cuda.is_available():
+    if device == "cuda" and not _gpu():
         raise FitError("no CUDA device is available", remedy="use --device cpu")
     torch.set_num_threads(native.threads())
     generators = loop.Generators(seed)
-    trainable = _load(TRAINED[model])(
+    trainable: loop.Trainable = _load(TRAINED[model])(
         source, train, test, settings=settings, generators=generators, progress=progress
     )
+    where = "cpu"
+    if device != "cpu" and _gpu() and (moved := trainable.on_device(_gpu())):
+        trainable, where = moved, _gpu()
     run = loop.Run(plan.budget_s, plan.steps)
     state = None if plan.out is None else _state_file(plan.out)
     best = None
@@ -216,9 +226,20 @@ def _trained(
     curve = tuple(run.curve)
     ran = _Ran(
         run.elapsed_s, run.cpu_s, run.done, trainable.queries, curve,
-        trainable.masked, run.interrupted, trainable.training_arrays(),
+        trainable.masked, run.interrupted, trainable.training_arrays(), where,
     )  # fmt: skip
     return trainable.material(), ran
+
+
+def _gpu() -> str:
+    """torch's name of the GPU; empty without one."""
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else ""
+
+
+def _on_cpu(model: str) -> str:
+    return f"trained on the CPU: {model} cannot use a GPU"
 
 
 def _traced(source: BTF | QuerySet | Relief) -> BTF | QuerySet:
@@ -300,6 +321,7 @@ def _report(
         interrupted=run.interrupted,
         out=None if out is None else os.fspath(out),
         settings=settings,
+        device=run.device,
     )
 
 

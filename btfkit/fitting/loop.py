@@ -75,6 +75,11 @@ class Trainable(ABC):
         del progress
         return True
 
+    def on_device(self, device: str) -> Trainable | None:
+        """The same model trained on a torch device, or None where it knows the CPU alone."""
+        del device
+        return None
+
     def slow_down(self) -> None:
         """Halve the learning rates, after a divergence."""
         raise FitError(f"{self.model} diverged and cannot slow down")

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from btfkit.fitting.adam import adam_plain
+from btfkit.fitting.loop import Trainable
 from btfkit.fitting.neumip_data import Batch
 from btfkit.fitting.neumip_recipe import Recipe, torch_loss
 from btfkit.fitting.neumip_settings import INPUTS
@@ -143,6 +144,11 @@ class NeuMIP(Recipe):
         if self.layout.heights:
             good &= np.isfinite(self.layout.surface(arrays["texels"])).all()
         return loss if good else math.nan
+
+    def on_device(self, device: str) -> Trainable:
+        from btfkit.fitting.neumip_device import OnDevice
+
+        return OnDevice(self, device)
 
     def _batch_size(self, progress: float) -> int:
         if self.settings.batch:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -89,6 +89,10 @@ class Recipe(Trainable, ABC):
         return self.material_type(self.spec, arrays, self._header)
 
     def score(self) -> float:
+        return self.scored(_by_material)
+
+    def scored(self, answers: Callable[[evaluated.NeuMIP, Batch], Array]) -> float:
+        """`score` by whatever answers the held-out queries for a material."""
         held = self._held
         good = np.isfinite(held.target)
         if not good.any():
@@ -98,8 +102,7 @@ class Recipe(Trainable, ABC):
             evaluated.name_arrays(self.spec, self.layout, *self._current()),
             self._header,
         )
-        blur = 0.5 if held.footprint is None else held.footprint
-        answer = material.evaluate(held.uv, held.light, held.view, blur).reflectance
+        answer = answers(material, held)
         with np.errstate(invalid="ignore"):
             error = np.log1p(np.maximum(held.target, -0.1)) - np.log1p(answer)
         return float(np.square(error[good]).mean())
@@ -117,6 +120,11 @@ class Recipe(Trainable, ABC):
 
     def slow_down(self) -> None:
         self._rate *= 0.5
+
+
+def _by_material(material: evaluated.NeuMIP, held: Batch) -> Array:
+    blur = 0.5 if held.footprint is None else held.footprint
+    return material.evaluate(held.uv, held.light, held.view, blur).reflectance
 
 
 def torch_loss(layout: Layout, weights: Tensor, texels: Tensor, batch: Batch, kind: str) -> Tensor:

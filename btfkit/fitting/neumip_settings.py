@@ -37,6 +37,8 @@ class Settings:
         precision: of the saved textures: float32, float16 or int8.
         pool_mb: memory for textures.
         wrap: of query files, which do not say it themselves.
+        matrix: what a GPU's kernels round the factors of products to: "fp32", "tf32", "bf16" or
+            "fp16"; sums are float32.
     """
 
     levels: int = 0
@@ -65,6 +67,7 @@ class Settings:
     precision: str = "float16"
     pool_mb: int = DEFAULT_BYTES >> 20
     wrap: str = "wrap"
+    matrix: str = "bf16"
 
     def __post_init__(self) -> None:
         choices = {
@@ -77,14 +80,16 @@ class Settings:
             "loss": ("square", "absolute"),
             "precision": ("float32", "float16", "int8"),
             "wrap": ("wrap", "clamp"),
+            "matrix": ("fp32", "tf32", "bf16", "fp16"),
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
                 known = ", ".join(map(str, allowed))
                 raise ValueError(f"{name} = {getattr(self, name)!r}; expected one of {known}")
         for name, low, high in (
-            ("levels", 0, 16), ("size", 0, 1 << 14), ("features", 1, 8), ("frames", 0, 2), ("coarse", 0, 8),
-            ("light", 0, 8), ("offset", 0, 8), ("width", 1, 128), ("offset_width", 1, 128),
+            ("levels", 0, 16), ("size", 0, 1 << 14), ("features", 1, 8), ("frames", 0, 2),
+            ("coarse", 0, 8), ("light", 0, 8), ("offset", 0, 8), ("width", 1, 128),
+            ("offset_width", 1, 128),
             ("batch", 0, 1 << 24), ("pool_mb", 1, 1 << 24), ("rate", 0, 1), ("texture_rate", 0, 1),
             ("beta2", 0, 0.999999), ("decay", 0, 100), ("omega", 0, 1000), ("smooth", 0, 8),
         ):  # fmt: skip
