@@ -96,4 +96,9 @@ class SetEncoder(nn.Module):
         """(t, latents) of values (t, k, c) under light and view (t or 1, k, 2)."""
         shape = values.shape[:2]
         parts = [values, light.expand(*shape, 2), view.expand(*shape, 2)]
-        return self.join(self.sample(torch.cat(parts, dim=-1)).mean(dim=1))
+        x = torch.cat(parts, dim=-1)
+        *hidden, last = self.sample.layers
+        for layer in hidden:
+            x = F.leaky_relu(layer(x), SLOPE)
+        # The last layer is linear: after the mean it has two thirds less of all to multiply.
+        return self.join(last(x.mean(dim=1)))
