@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple, final
@@ -49,10 +50,7 @@ def broadcast(
     footprint: ArrayLike = 0.5,
     curvature: ArrayLike = 0.0,
 ) -> tuple[Query, tuple[int, ...]]:
-    """One flat, contiguous float32 query from parts whose leading shapes broadcast.
-
-    uv keeps its texel where it is huge: it is reduced to one tile in float64 by the caller
-    that knows the wrap, so it is left in float64 here.
+    """One flat, contiguous query from parts whose leading shapes broadcast.
 
     Returns:
         query: every part flattened to (b, ...); uv float64, the rest float32.
@@ -61,8 +59,40 @@ def broadcast(
     Raises:
         ValueError: wrong last axes, or leading shapes that do not broadcast.
     """
+    query, shape = flatten(uv, light, view, footprint, curvature)
+    b = math.prod(shape)
+    first, *rest = (
+        part
+        if len(part) == b
+        else np.ascontiguousarray(np.broadcast_to(part, (b, *part.shape[1:])))
+        for part in query
+    )
+    return Query(first.astype(np.float64, copy=False), *rest), shape
+
+
+def flatten(
+    uv: ArrayLike,
+    light: ArrayLike,
+    view: ArrayLike,
+    footprint: ArrayLike = 0.5,
+    curvature: ArrayLike = 0.0,
+) -> tuple[Query, tuple[int, ...]]:
+    """As `broadcast`, but copies as little as it can.
+
+    uv keeps its texel where it is huge: it is reduced to one tile by the caller that knows the
+    wrap, so it is left in float64 here unless it came in float32.
+
+    Returns:
+        query: every part flattened to (b, ...), or to one row where that holds for all; uv
+            float32 or float64, the rest float32; all contiguous.
+        shape: the leading shape that the flat answer unfolds to.
+
+    Raises:
+        ValueError: wrong last axes, or leading shapes that do not broadcast.
+    """
+    place = np.asarray(uv)
     parts: tuple[NDArray[Any], ...] = (
-        np.asarray(uv, np.float64),
+        np.asarray(place, np.float32 if place.dtype == np.float32 else np.float64),
         np.asarray(light, np.float32),
         np.asarray(view, np.float32),
     )
@@ -75,12 +105,15 @@ def broadcast(
         shape = np.broadcast_shapes(*leading)
     except ValueError as error:
         raise ValueError(f"leading shapes {leading} do not broadcast") from error
-    vectors = [
-        np.ascontiguousarray(np.broadcast_to(p, (*shape, p.shape[-1]))).reshape(-1, p.shape[-1])
-        for p in parts
-    ]
-    values = [np.ascontiguousarray(np.broadcast_to(s, shape)).reshape(-1) for s in scalars]
-    return Query(*vectors, *values), shape
+    flat = [_rows(part, shape, part.shape[-1:]) for part in parts]
+    return Query(*flat, *(_rows(part, shape, ()) for part in scalars)), shape
+
+
+def _rows(part: NDArray[Any], shape: tuple[int, ...], last: tuple[int, ...]) -> NDArray[Any]:
+    """A part as (b, ...) or, where one row holds for all, (1, ...)."""
+    if part.size == math.prod(last):
+        return np.ascontiguousarray(part).reshape(1, *last)
+    return np.ascontiguousarray(np.broadcast_to(part, (*shape, *last))).reshape(-1, *last)
 
 
 @final

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from btfkit import queries
 from btfkit.btf import QUANTITY, RGB, Wrap
+from btfkit.native.prepare import Prepared, prepare
 from btfkit.queries import Query, Response
 
 Array = NDArray[np.float32]
@@ -102,7 +104,8 @@ class Material(ABC):
         """Reflectance (b, c) and opacity (b,), None for opaque, of a flat query.
 
         uv is reduced to the tile or clamped to it, 0..1; every value is finite, view is above
-        the horizon, and light too unless the model answers for the full sphere.
+        the horizon, and light too unless the model answers for the full sphere. Where one
+        footprint or curvature holds for all, its stride is 0.
         """
 
     @final
@@ -130,67 +133,46 @@ class Material(ABC):
         Raises:
             ValueError: wrong last axes, or shapes that do not broadcast.
         """
-        query, shape = queries.broadcast(uv, light, view, footprint, curvature)
-        c = len(self.header.channels)
-        rgb = np.zeros((len(query.uv), c), np.float32)
-        opacity = np.zeros(len(query.uv), np.float32)
+        query, shape = queries.flatten(uv, light, view, footprint, curvature)
+        b, c = math.prod(shape), len(self.header.channels)
+        rgb, opacity = np.empty((b, c), np.float32), np.empty(b, np.float32)
         masked = 0
-        for start in range(0, len(query.uv), _BLOCK):
-            block = Query(*(part[start : start + _BLOCK] for part in query))
-            masked += self._answer_block(block, rgb[start:], opacity[start:])
+        for start in range(0, b, _BLOCK):
+            some = slice(start, start + _BLOCK)
+            block = Query(*(part if len(part) == 1 else part[some] for part in query))
+            masked += self._answer_block(block, rgb[some], opacity[some])
         if masked:
             warnings.warn(
-                f"{masked} of {len(query.uv)} queries are not finite or seen from below the "
+                f"{masked} of {b} queries are not finite or seen from below the "
                 "horizon; they answer 0 with opacity 0",
                 stacklevel=2,
             )
         return Response(rgb.reshape(*shape, c), opacity.reshape(shape))
 
     def _answer_block(self, query: Query, rgb: Array, opacity: Array) -> int:
-        """Answer one block into the heads of `rgb` and `opacity`; returns how many are masked."""
-        light, light_ok = _unit(query.light)
-        view, view_ok = _unit(query.view)
-        good = light_ok & view_ok & (view[:, 2] >= 0)
-        good &= np.isfinite(query.uv).all(axis=1)
-        good &= np.isfinite(query.footprint) & np.isfinite(query.curvature)
-        masked = int(len(good) - good.sum())
-        self._warn_of_missing_parts(query, good)
-        rows = np.flatnonzero(good)
-        opacity[rows] = 1.0
-        if not self.full_sphere:
-            rows = np.flatnonzero(good & (light[:, 2] > 0))
-        if rows.size:
-            uv = query.uv[rows]
-            uv = uv - np.floor(uv) if self.header.wrap == "wrap" else np.clip(uv, 0.0, 1.0)
-            values, cover = self._answer(
-                Query(
-                    uv.astype(np.float32),
-                    light[rows],
-                    view[rows],
-                    np.maximum(query.footprint[rows], 0.0),
-                    query.curvature[rows],
-                )
-            )
-            if cover is not None:
-                opacity[rows] = cover
-                values = np.where(cover[:, None] > 0, values, 0.0)
-            rgb[rows] = values
-        return masked
+        """Answer one block into `rgb` and `opacity`; returns how many are masked."""
+        ready = prepare(*query, opacity, wrap=self.header.wrap == "wrap", below=self.full_sphere)
+        self._warn_of_missing_parts(ready)
+        m = len(ready.uv)
+        if ready.rows is not None:
+            rgb[:] = 0
+        if not m:
+            return ready.masked
+        blur, bend = (np.broadcast_to(part, m) for part in (ready.footprint, ready.curvature))
+        values, cover = self._answer(Query(ready.uv, ready.light, ready.view, blur, bend))
+        rows = slice(None) if ready.rows is None else ready.rows
+        if cover is not None:
+            opacity[rows] = cover
+            values = np.where(cover[:, None] > 0, values, 0.0)
+        rgb[rows] = values
+        return ready.masked
 
-    def _warn_of_missing_parts(self, query: Query, good: NDArray[np.bool_]) -> None:
-        for part, has, neutral in (
-            ("footprint", self.has_levels, query.footprint <= 0.5),
-            ("curvature", self.has_curvature, query.curvature == 0),
+    def _warn_of_missing_parts(self, ready: Prepared) -> None:
+        for part, has, asked in (
+            ("footprint", self.has_levels, ready.blurred),
+            ("curvature", self.has_curvature, ready.curved),
         ):
-            if not has and part not in self._warned and not np.all(neutral | ~good):
+            if asked and not has and part not in self._warned:
                 self._warned.add(part)
                 what = "at its finest level" if part == "footprint" else "on the plane"
                 warnings.warn(f"{self.model} knows no {part}: it answers {what}", stacklevel=4)
-
-
-def _unit(direction: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Unit vectors (b, 3) float32, and (b,) whether there was a direction to normalise."""
-    length = np.linalg.norm(direction.astype(np.float64), axis=1)
-    good = np.isfinite(length) & (length > 1e-30)
-    unit = direction / np.where(good, length, 1.0)[:, None]
-    return unit.astype(np.float32), good

@@ -15,6 +15,7 @@ KERNELS: tuple[str, ...] = (
     "trace",
     "neumip",
     "factors",
+    "prepare",
 )
 
 
