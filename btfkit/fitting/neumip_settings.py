@@ -43,13 +43,13 @@ class Settings:
 
     levels: int = 0
     size: int = 0
-    features: int = 7
+    features: int = 8
     frames: int = 2
     coarse: int = 0
     light: int = 0
     offset: int = 7
     depth: str = "heights"
-    width: int = 25
+    width: int = 28
     offset_width: int = 25
     activation: str = "leaky"
     offset_activation: str = "relu"

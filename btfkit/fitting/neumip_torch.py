@@ -78,19 +78,24 @@ def _crossing(surface: Tensor, uv: Tensor, along: Tensor, *, wrap: bool) -> Tens
     def above(t: Tensor) -> Tensor:
         return t - bilinear(surface[..., None], uv + t[:, None] * along, wrap=wrap)[:, 0]
 
-    t = top.expand(len(uv))
-    gap = above(t)
-    met = bottom.expand(len(uv))
+    def met(high: Tensor, low: Tensor, gap: Tensor, under: Tensor) -> Tensor:
+        return high + (low - high) * (gap / (gap - under).clamp(min=1e-12))
+
+    low = high = top.expand(len(uv))
+    under = gap = above(low)
     going = torch.ones(len(uv), dtype=torch.bool, device=uv.device)
     for k in range(1, MARCH + 1):
-        at = top + (bottom - top) * (k / count).clamp(max=1)
-        below = above(at)
-        here = going & (below <= 0)
-        share = gap / (gap - below).clamp(min=1e-12)
-        met = torch.where(here, t + (at - t) * share, met)
-        going = going & ~here
-        t, gap = at, below
-    return met
+        high, gap = torch.where(going, low, high), torch.where(going, under, gap)
+        to = top + (bottom - top) * (k / count).clamp(max=1)
+        found = above(to)
+        low, under = torch.where(going, to, low), torch.where(going, found, under)
+        going = going & (found > 0)
+    first = met(high, low, gap, under)
+    rest = above(first)
+    short = rest > 0
+    high, gap = torch.where(short, first, high), torch.where(short, rest, gap)
+    low, under = torch.where(short, low, first), torch.where(short, under, rest)
+    return met(high, low, gap, under)
 
 
 def log_answer(layout: Layout, raw: Tensor) -> Tensor:

@@ -1,20 +1,37 @@
 // View rays through a texture of heights: included after neumip_lookup.hpp, once a variant.
 
-constexpr int kMarch = 16;         // looks at most along a ray
+constexpr int kMarch = 8;          // looks at most along a ray
 constexpr float kSteepest = 0.1f;  // lowest cosine of a ray
 constexpr float kFlattest = 0.3f;  // a ray that grazes the surface moves its crossing no faster
 
 #if NEUMIP_LANES == 16
 FN F gathered(const float* p, I at) { return (F)_mm512_i32gather_ps((__m512i)at, p, 4); }
+// Floats at `at` and beside it: half as many loads as two gathers take.
+FN void gathered_pair(const float* p, I at, F& left, F& right) {
+    const __m512i i = (__m512i)at;
+    const __m512 low = _mm512_castpd_ps(_mm512_i32gather_pd(_mm512_castsi512_si256(i), p, 4));
+    const __m512 high = _mm512_castpd_ps(_mm512_i32gather_pd(_mm512_extracti64x4_epi64(i, 1), p, 4));
+    const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+    left = (F)_mm512_permutex2var_ps(low, even, high);
+    right = (F)_mm512_permutex2var_ps(low, _mm512_or_si512(even, _mm512_set1_epi32(1)), high);
+}
 FN bool any_of(I mask) { return _mm512_movepi32_mask((__m512i)mask) != 0; }
 #elif NEUMIP_LANES == 8
 FN F gathered(const float* p, I at) { return (F)_mm256_i32gather_ps(p, (__m256i)at, 4); }
+FN void gathered_pair(const float* p, I at, F& left, F& right) {
+    left = gathered(p, at);
+    right = gathered(p, at + 1);
+}
 FN bool any_of(I mask) { return _mm256_movemask_ps((__m256)mask) != 0; }
 #else
 FN F gathered(const float* p, I at) {
     F x;
     for (int i = 0; i < L; ++i) x[i] = p[at[i]];
     return x;
+}
+FN void gathered_pair(const float* p, I at, F& left, F& right) {
+    left = gathered(p, at);
+    right = gathered(p, at + 1);
 }
 FN bool any_of(I mask) {
     int32_t some = 0;
@@ -33,9 +50,15 @@ struct Surface {
     }
     MEMBER F at(F u, F v) const {
         const Corners c = around(u, v);
-        const F a = gathered(heights, c.at[0]), b = gathered(heights, c.at[2]);
-        const F upper = a + (gathered(heights, c.at[1]) - a) * c.fx;
-        const F lower = b + (gathered(heights, c.at[3]) - b) * c.fx;
+        F h[4];
+        if (!any_of(c.at[1] != c.at[0] + 1)) {
+            gathered_pair(heights, c.at[0], h[0], h[1]);
+            gathered_pair(heights, c.at[2], h[2], h[3]);
+        } else {  // a lane at the border of the tile
+            for (int j = 0; j < 4; ++j) h[j] = gathered(heights, c.at[j]);
+        }
+        const F upper = h[0] + (h[1] - h[0]) * c.fx;
+        const F lower = h[2] + (h[3] - h[2]) * c.fx;
         return upper + (lower - upper) * c.fy;
     }
     // Height at which rays first meet the surface; (du, dv) is their way in uv a unit of height.
@@ -46,21 +69,29 @@ struct Surface {
         // ceil, 1 to kMarch
         const F count = smaller(larger(-floor_of(-texels), all(1.f)), all(float(kMarch)));
         const F part = 1.f / count;
-        F t = all(top), met = all(bottom);
-        F gap = t - at(u + t * du, v + t * dv);
+        // Between `high`, above the surface by `gap`, and `low`, below it by -`under`.
+        F high = all(top), low = high;
+        F gap = high - at(u + high * du, v + high * dv), under = gap;
         I going = ~I{};
         for (int k = 1; k <= kMarch; ++k) {
+            high = select(going, low, high);
+            gap = select(going, under, gap);
             const F to = top - rise * smaller(float(k) * part, all(1.f));
-            const F below = to - at(u + to * du, v + to * dv);
-            const I here = going & (below <= all(0.f));
-            const F share = gap / larger(gap - below, all(1e-12f));
-            met = select(here, t + (to - t) * share, met);
-            going &= ~here;
+            const F found = to - at(u + to * du, v + to * dv);
+            low = select(going, to, low);
+            under = select(going, found, under);
+            going &= found > all(0.f);
             if (!any_of(going)) break;
-            t = to;
-            gap = below;
         }
-        return met;
+        // Twice where a straight surface would be met.
+        const F met = high + (low - high) * (gap / larger(gap - under, all(1e-12f)));
+        const F rest = met - at(u + met * du, v + met * dv);
+        const I above = rest > all(0.f);
+        high = select(above, met, high);
+        gap = select(above, rest, gap);
+        low = select(above, low, met);
+        under = select(above, under, rest);
+        return high + (low - high) * (gap / larger(gap - under, all(1e-12f)));
     }
 };
 

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from btfkit.native.neumip_layout import DIRECTIONS, LEAK, Layout, Network, Pyramid
 
+Array = NDArray[Any]
 # Looks at most along a view ray.
-MARCH = 16
+MARCH = 8
 # Lowest cosine of a view ray through heights: 84 degrees.
 STEEPEST = 0.1
 # Where a ray grazes the surface, its crossing moves no faster than 1 / FLATTEST of a height.
@@ -107,7 +108,7 @@ def crossing(
     """Height (b,) at which rays from above first meet a surface of bilinear heights.
 
     A ray is at uv + t * along at height t. It is looked at a texel apart, or at MARCH places
-    where it is longer; between two of them it is taken as straight.
+    where it is longer; between two of them the surface is taken as straight, twice.
 
     Args:
         heights: (h, w). uv, along: (b, 2).
@@ -117,22 +118,27 @@ def crossing(
     count = march_steps(along, float(top - bottom), (h, w))
     surface = heights[..., None]
 
-    def above(t: NDArray[Any]) -> NDArray[Any]:
+    def above(t: Array) -> Array:
         return t - bilinear(surface, uv + t[:, None] * along, wrap=wrap)[:, 0]
 
-    t = np.full(len(uv), top, heights.dtype)
-    gap = above(t)
-    met = np.full(len(uv), bottom, heights.dtype)
+    def met(high: Array, low: Array, gap: Array, under: Array) -> Array:
+        return high + (low - high) * (gap / np.maximum(gap - under, 1e-12))
+
+    low = high = np.full(len(uv), top, heights.dtype)
+    under = gap = above(low)
     going = np.ones(len(uv), bool)
     for k in range(1, MARCH + 1):
-        at = top + (bottom - top) * np.minimum(k / count, 1).astype(heights.dtype)
-        below = above(at)
-        here = going & (below <= 0)
-        share = gap / np.maximum(gap - below, 1e-12)
-        met = np.where(here, t + (at - t) * share, met)
-        going &= ~here
-        t, gap = at, below
-    return met
+        high, gap = np.where(going, low, high), np.where(going, under, gap)
+        to = top + (bottom - top) * np.minimum(k / count, 1).astype(heights.dtype)
+        found = above(to)
+        low, under = np.where(going, to, low), np.where(going, found, under)
+        going &= found > 0
+    first = met(high, low, gap, under)
+    rest = above(first)
+    short = rest > 0
+    high, gap = np.where(short, first, high), np.where(short, rest, gap)
+    low, under = np.where(short, low, first), np.where(short, under, rest)
+    return met(high, low, gap, under)
 
 
 def march_steps(along: NDArray[Any], rise: float, size: tuple[int, int]) -> NDArray[Any]:
