@@ -5,18 +5,25 @@ import triton.language as tl
 
 
 @triton.jit
+def _rounded(x):
+    """float32 with the digits of bfloat16, to nearest, ties to even."""
+    bits = x.to(tl.int32, bitcast=True)
+    bits = (bits + 32767 + ((bits >> 16) & 1)) & -65536
+    return bits.to(tl.float32, bitcast=True)
+
+
+@triton.jit
 def times(a, b, kind: tl.constexpr, exact: tl.constexpr):
     """a @ b with factors of `kind`, and sums of float32."""
     if kind == tl.float16:
         # Numbers beyond float16 end at its largest, not at infinity.
         a = tl.minimum(tl.maximum(a, -65504.0), 65504.0)
         b = tl.minimum(tl.maximum(b, -65504.0), 65504.0)
-    a, b = a.to(kind), b.to(kind)
     if exact == "rounded":
-        # Triton's interpreter multiplies the bits of bfloat16: as float32 the products are right.
-        return tl.dot(a.to(tl.float32), b.to(tl.float32), input_precision="ieee")
+        # Triton's interpreter cuts bfloat16 off where a GPU rounds, and multiplies its bits.
+        return tl.dot(_rounded(a), _rounded(b), input_precision="ieee")
     else:
-        return tl.dot(a, b, input_precision=exact)
+        return tl.dot(a.to(kind), b.to(kind), input_precision=exact)
 
 
 @triton.jit
