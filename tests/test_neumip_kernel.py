@@ -181,6 +181,63 @@ def test_kernel_answers_as_its_twin(name, variant):
 
 @compiled
 @pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("name", CASES)
+def test_networks_of_bfloat16_answer_as_their_twin(name, variant):
+    case, rng = CASES[name], np.random.default_rng(3)
+    weights, texels = parameters(case, rng)
+    texels *= 0.3
+    parts = queries(case, rng)
+    wanted = plain.evaluate_plain(case, weights, texels, *parts, raw=True, networks="bfloat16")
+    kernel = Kernel(case, variant=variant, networks="bfloat16")
+    found = kernel.evaluate(weights, texels, *parts, raw=True)
+    # A sum that another order moves over the middle between two bfloat16, 0.4 % apart, moves
+    # all that follows: some in ten thousand do.
+    assert relative(found, wanted) < 1e-3
+    exact = plain.evaluate_plain(case, weights, texels, *parts, raw=True)
+    off = relative(found, exact)
+    assert off < 0.05  # eight significant bits through up to eight layers
+    # The rounding is there, and it is the same one.
+    assert relative(found, wanted) < off / 4
+    depth = kernel.depths(weights, texels, parts[0], parts[2])
+    twin = plain.depths_plain(case, weights, texels, parts[0], parts[2], networks="bfloat16")
+    assert relative(depth, twin) < 1e-3
+
+
+def test_bfloat16_is_the_nearest_number_of_eight_bits_ties_to_even():
+    ulp = 2.0**-7  # between 1 and 2
+    given = [
+        1.0,
+        -0.0,
+        1 + ulp,
+        1 + 0.5 * ulp,
+        1 + 1.5 * ulp,
+        1 + 0.51 * ulp,
+        -1 - 0.49 * ulp,
+        1e30,
+    ]
+    wanted = [1.0, -0.0, 1 + ulp, 1.0, 1 + 2 * ulp, 1 + ulp, -1.0, 1e30]
+    found = plain.bfloat16(np.array(given, np.float32))
+    np.testing.assert_array_equal(found[:7], wanted[:7])
+    assert np.signbit(found[1])
+    assert found[7] == pytest.approx(1e30, rel=2.0**-8)
+    assert plain.bfloat16(np.array(given)).dtype == np.float64
+
+
+@compiled
+def test_training_knows_no_bfloat16():
+    case, rng = CASES["sine"], np.random.default_rng(5)
+    weights, texels = parameters(case, rng)
+    parts, target = queries(case, rng, 300), rng.random((300, 3)).astype(np.float32)
+    grown = []
+    for networks in ("float32", "bfloat16"):
+        kernel = Kernel(case, networks=networks)
+        grown.append((kernel.train(weights, texels, *parts, target), *kernel.gradients()))
+    for first, second in zip(*grown, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+@compiled
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("loss", ["square", "absolute"])
 @pytest.mark.parametrize("name", CASES)
 def test_gradients_are_those_of_float64_autograd(name, loss, variant):

@@ -16,8 +16,16 @@ from numpy.typing import ArrayLike, NDArray
 from btfkit.directions import normalize
 from btfkit.materials.base import Array, Header, Material
 from btfkit.native.neumip import Kernel, available
-from btfkit.native.neumip_layout import CHANNELS, Activation, Layout, Network, Output, Pyramid
-from btfkit.native.neumip_plain import depths_plain, evaluate_plain
+from btfkit.native.neumip_layout import (
+    CHANNELS,
+    Activation,
+    Layout,
+    Network,
+    Networks,
+    Output,
+    Pyramid,
+)
+from btfkit.native.neumip_plain import bfloat16, depths_plain, evaluate_plain
 from btfkit.queries import Query
 
 Precision = Literal["float32", "float16", "int8"]
@@ -49,6 +57,9 @@ class NeuMIPSpec:
         depth_scale: tile widths a unit of the offset network, or of the heights.
         channels: of the answer.
         precision: of the stored textures.
+        networks: what evaluation multiplies after each network's first layer. "bfloat16" is
+            faster where the processor multiplies pairs of them, and equal elsewhere but for
+            rounding; these matrices are stored rounded, in float32.
     """
 
     size: tuple[int, int]
@@ -68,6 +79,7 @@ class NeuMIPSpec:
     precision: Precision = "float32"
     heights: bool = False
     frames: int = 0
+    networks: Networks = "float32"
 
     def layout(self, header: Header) -> Layout:
         """The model as its kernels see it."""
@@ -125,7 +137,7 @@ class _NeuMIP(Material):
         super().__init__(spec, weights, header)
         self.layout = spec.layout(header)
         self.flat, self.texels = flatten(spec, self.layout, self.weights)
-        self._kernel = Kernel(self.layout) if available() else None
+        self._kernel = Kernel(self.layout, networks=spec.networks) if available() else None
         if self._kernel:
             self._kernel.freeze(self.texels)
 
@@ -150,7 +162,7 @@ class _NeuMIP(Material):
         parts = (self.flat, self.texels, query.uv, query.light, query.view, footprint)
         released = self.spec.output == "released"
         if self._kernel is None:
-            answer = evaluate_plain(self.layout, *parts, raw=released)
+            answer = evaluate_plain(self.layout, *parts, raw=released, networks=self.spec.networks)
         else:
             answer = self._kernel.evaluate(*parts, raw=released)
         answer = released_answer(answer) if released else answer
@@ -196,7 +208,9 @@ class _NeuMIP(Material):
         where = np.ascontiguousarray(np.asarray(uv, np.float32).reshape(-1, 2))
         seen = np.ascontiguousarray(normalize(view).reshape(-1, 3), np.float32)
         if self._kernel is None:
-            return depths_plain(self.layout, self.flat, self.texels, where, seen)
+            return depths_plain(
+                self.layout, self.flat, self.texels, where, seen, networks=self.spec.networks
+            )
         return self._kernel.depths(self.flat, self.texels, where, seen)
 
 
@@ -257,7 +271,9 @@ def name_arrays(
     parts = layout.split(flat) if layout.offset else layout.split(flat)[1:]
     for (name, network), part in zip(_networks(layout), parts, strict=True):
         for k, (matrix, bias) in enumerate(network.layers(part)):
-            found[f"{name}.{k}.weight"], found[f"{name}.{k}.bias"] = matrix.copy(), bias.copy()
+            rounded = k > 0 and spec.networks == "bfloat16"
+            found[f"{name}.{k}.weight"] = bfloat16(matrix) if rounded else matrix.copy()
+            found[f"{name}.{k}.bias"] = bias.copy()
     for view, (name, _, channels) in zip(_views(layout, texels), _textures(layout), strict=True):
         texture = view[..., :channels]
         if spec.precision == "int8":
@@ -272,9 +288,16 @@ def name_arrays(
     return found
 
 
-def in_precision(material: _NeuMIP, precision: Precision) -> _NeuMIP:
-    """The same model with its textures stored as float32, float16 or int8."""
-    spec = replace(material.spec, precision=precision)
+def in_precision(
+    material: _NeuMIP, precision: Precision, networks: Networks | None = None
+) -> _NeuMIP:
+    """The same model with its textures stored as float32, float16 or int8.
+
+    Args:
+        networks: what evaluation multiplies, as in `NeuMIPSpec`; None leaves it. Matrices that
+            were rounded stay so.
+    """
+    spec = replace(material.spec, precision=precision, networks=networks or material.spec.networks)
     arrays = name_arrays(spec, material.layout, material.flat, material.texels)
     return type(material)(spec, arrays, material.header)
 

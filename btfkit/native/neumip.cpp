@@ -86,6 +86,15 @@ std::vector<Variant> supported() {
     return found;
 }
 
+bool multiplies_pairs() {
+#if defined(__x86_64__) && (defined(__clang__) || __GNUC__ >= 10)
+    __builtin_cpu_init();
+    return __builtin_cpu_supports("avx512bf16");
+#else
+    return false;
+#endif
+}
+
 Variant variant(const std::string& name) {
     const auto known = supported();
     if (name.empty()) return known.front();
@@ -128,7 +137,7 @@ class Model {
           const std::vector<int>& heights,
           const std::vector<int>& offset_widths, const std::vector<int>& offset_directions,
           int offset_activation, const std::vector<int>& widths,
-          const std::vector<int>& directions, int activation) {
+          const std::vector<int>& directions, int activation, bool half) {
         Plan& p = plan_;
         p.wrap = wrap;
         p.aspect = aspect;
@@ -136,6 +145,8 @@ class Model {
         p.output = output;
         p.channels = channels;
         p.frames = frames;
+        p.half = half;
+        p.pairs = multiplies_pairs();
         for (const auto& t : textures) {
             require(t.size() == 3, "a texture is (h, w, start)");
             p.textures.push_back({int(t[0]), int(t[1]), t[2]});
@@ -346,7 +357,7 @@ NB_MODULE(_neumip, m) {
         .def(nb::init<bool, float, float, int, int, int, const std::vector<std::vector<int64_t>>&,
                       const std::vector<std::vector<double>>&, bool, const std::vector<int>&,
                       const std::vector<int>&, const std::vector<int>&, int, const std::vector<int>&,
-                      const std::vector<int>&, int>())
+                      const std::vector<int>&, int, bool>())
         .def_prop_ro("weights", &Model::weights)
         .def_prop_ro("texels", &Model::texels)
         .def("evaluate", &Model::evaluate, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),

@@ -15,6 +15,7 @@ from btfkit.native.neumip_layout import (
     Array,
     Layout,
     Network,
+    Networks,
 )
 
 Loss = Literal["square", "absolute"]
@@ -25,13 +26,21 @@ class Kernel:
     """The compiled form of one layout: the same answers, and training.
 
     Gradients of `train` add up here, a buffer a thread, until `adam` uses and zeroes them.
-    Equal threads and variant give equal results.
+    Equal threads and variant give equal results. `networks` is what evaluation multiplies, as in
+    `evaluate_plain`; training is float32.
 
     Raises:
         RuntimeError: the extension was not built; see `available`.
     """
 
-    def __init__(self, layout: Layout, *, variant: str = "", threads: int | None = None) -> None:
+    def __init__(
+        self,
+        layout: Layout,
+        *,
+        variant: str = "",
+        threads: int | None = None,
+        networks: Networks = "float32",
+    ) -> None:
         module = native.load("neumip")
         if module is None:
             raise RuntimeError("the NeuMIP kernel was not built; use evaluate_plain")
@@ -62,6 +71,7 @@ class Kernel:
             list(layout.heights or ()),
             *_network(offset),
             *_network(layout.decoder),
+            networks == "bfloat16",
         )
         self._layout = layout
 

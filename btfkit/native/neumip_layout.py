@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 Activation = Literal["linear", "relu", "leaky", "sine"]
 Output = Literal["log", "relu", "mask"]
+Networks = Literal["float32", "bfloat16"]
 
 CHANNELS = 8  # numbers a texel
 LEAK = 0.01

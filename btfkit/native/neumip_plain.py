@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.native.neumip_layout import DIRECTIONS, LEAK, Layout, Network, Pyramid
+from btfkit.native.neumip_layout import DIRECTIONS, LEAK, Layout, Network, Networks, Pyramid
 
 Array = NDArray[Any]
 # Looks at most along a view ray.
@@ -29,6 +29,7 @@ def evaluate_plain(
     footprint: NDArray[Any] | None = None,
     *,
     raw: bool = False,
+    networks: Networks = "float32",
 ) -> NDArray[Any]:
     """Reflectance (b, c) for flat queries; `raw` gives the decoder's numbers instead.
 
@@ -36,9 +37,11 @@ def evaluate_plain(
         layout: the model. weights: (layout.weights,). texels: (layout.texels, 8).
         uv: (b, 2). light, view: (b, 3) unit vectors.
         footprint: (b,) texels of the data's grid; None is 0.5 throughout.
+        networks: with "bfloat16" the weights and inputs of all layers but the first are rounded
+            to it; products are summed as before.
     """
     known = _directions(light, view, footprint)
-    depth = depths_plain(layout, weights, texels, uv, view)
+    depth = depths_plain(layout, weights, texels, uv, view, networks=networks)
     textures = layout.textures(texels)[1 if layout.offset else 0 :]
     parts = []
     for bank, levels in zip(layout.banks, textures, strict=True):
@@ -51,7 +54,7 @@ def evaluate_plain(
     for k in range(layout.frames):
         axis = parts[0][:, 3 * k : 3 * k + 3]
         parts += [(axis * direction).sum(axis=1, keepdims=True) for direction in (half, light)]
-    z = _run(layout.decoder, layout.split(weights)[1], parts, known)
+    z = _run(layout.decoder, layout.split(weights)[1], parts, known, networks)
     if raw:
         return z
     c = layout.channels
@@ -68,6 +71,8 @@ def depths_plain(
     texels: NDArray[Any],
     uv: NDArray[Any],
     view: NDArray[Any],
+    *,
+    networks: Networks = "float32",
 ) -> NDArray[Any]:
     """Ray depth (b,) of the offset stage, tile widths, positive above the plane of uv.
 
@@ -82,7 +87,8 @@ def depths_plain(
     pyramid, network = layout.offset
     psi = bilinear(layout.textures(texels)[0][0], uv, wrap=layout.wrap)[:, : pyramid.channels]
     known = _directions(view, view, None)
-    return _run(network, layout.split(weights)[0], [psi], known)[:, 0] * layout.depth_scale
+    raw = _run(network, layout.split(weights)[0], [psi], known, networks)
+    return raw[:, 0] * layout.depth_scale
 
 
 def step(direction: NDArray[Any], layout: Layout) -> NDArray[Any]:
@@ -167,9 +173,13 @@ def _run(
     flat: NDArray[Any],
     features: Sequence[NDArray[Any]],
     known: dict[str, NDArray[Any]],
+    networks: Networks,
 ) -> NDArray[Any]:
     x = np.concatenate([*features, *(known[d][:, None] for d in network.directions)], axis=1)
     layers = network.layers(flat)
+    half = networks == "bfloat16"
+    if half:
+        layers[1:] = [(bfloat16(matrix), bias) for matrix, bias in layers[1:]]
     for matrix, bias in layers[:-1]:
         x = x @ matrix.T + bias
         if network.activation == "relu":
@@ -178,8 +188,16 @@ def _run(
             x = np.where(x > 0, x, x * np.asarray(LEAK, x.dtype))
         elif network.activation == "sine":
             x = np.sin(x)
+        x = bfloat16(x) if half else x
     matrix, bias = layers[-1]
     return x @ matrix.T + bias
+
+
+def bfloat16(x: NDArray[Any]) -> NDArray[Any]:
+    """The nearest numbers of eight significant bits, ties to even, in the dtype of x."""
+    bits = np.asarray(x, np.float32).view(np.uint32)
+    near = (bits + 0x7FFF + ((bits >> 16) & 1)) & np.uint32(0xFFFF0000)
+    return near.view(np.float32).astype(x.dtype)
 
 
 def _between_levels(

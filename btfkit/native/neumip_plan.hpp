@@ -53,6 +53,8 @@ struct Plan {
     int output = kLog, channels = 3;
     int frames = 0;  // vectors among the first features: the decoder takes their products with
                      // the half vector and with the light
+    bool half = false;   // products of bfloat16 in evaluation, after each network's first layer
+    bool pairs = false;  // whether the processor multiplies them by pairs
     std::vector<Texture> textures;
     Bank offset_bank{};
     Texture heights{0, 0, 0};  // one float a texel, first of all; h = 0 where there are none

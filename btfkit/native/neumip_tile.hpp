@@ -27,10 +27,10 @@ struct Tile {
                        bool train)
         : plan(p), texels(t) {
         surface = {t, float(p.heights.w), float(p.heights.h), b.top, b.bottom, p.wrap};
-        decoder.pack(p.decoder, weights, train);
+        decoder.pack(p.decoder, weights, train, p.half, p.pairs && L == 16);
         decoder_trace.reset(p.decoder, train);
         if (p.offset) {
-            offset.pack(p.offset_mlp, weights, train);
+            offset.pack(p.offset_mlp, weights, train, p.half, p.pairs && L == 16);
             offset_trace.reset(p.offset_mlp, train);
         }
         in.reset(kInRows);
