@@ -45,6 +45,8 @@ def material(spec=None, *, wrap="wrap", grid=(12, 20), seed=0, kind=NeuMIP):
             texture[..., : pyramid.channels] = 0.5 * rng.standard_normal(
                 (*texture.shape[:2], pyramid.channels)
             )
+    if case.heights:
+        case.surface(texels)[:] = rng.standard_normal(case.heights)
     weights = (0.3 * rng.standard_normal(case.weights)).astype(np.float32)
     return kind(spec, name_arrays(spec, case, weights, texels), header)
 
@@ -185,8 +187,10 @@ def test_a_relief_is_found_from_pictures_alone():
 
 
 @pytest.mark.parametrize("wrap", ["wrap", "clamp"])
-def test_one_million_random_queries_give_finite_answers(wrap):
+@pytest.mark.parametrize("heights", [False, True])
+def test_one_million_random_queries_give_finite_answers(wrap, heights):
     """Groups 1, 10, 11: directions at exactly 90 degrees, footprints 0 to 1e6, any u and v."""
+    spec = NeuMIPSpec((12, 20), 4, heights=True, frames=2) if heights else None
     rng = np.random.default_rng(3)
     count = 1_000_000
     light, view = upper(rng, count), upper(rng, count)
@@ -198,7 +202,7 @@ def test_one_million_random_queries_give_finite_answers(wrap):
     footprint[:10], footprint[10:20] = 0, 1e6
     uv = rng.normal(0, 5, (count, 2))
     uv[:100] = rng.choice([0, 1, -1, 1e6, -1e6, 0.5], (100, 2))
-    rgb, opacity = material(wrap=wrap).evaluate(uv, light, view, footprint)
+    rgb, opacity = material(spec, wrap=wrap).evaluate(uv, light, view, footprint)
     assert np.isfinite(rgb).all()
     assert (rgb >= 0).all()
     assert (opacity == 1).all()
@@ -494,10 +498,12 @@ def test_settings_are_checked():
 EXTREMES = [
     {"levels": "16"}, {"size": "1"}, {"size": "3"}, {"features": "1"}, {"features": "8"},
     {"coarse": "8", "light": "8"}, {"offset": "0"}, {"offset": "8"}, {"width": "1"},
-    {"width": "128", "offset_width": "1"}, {"activation": "leaky"}, {"offset_activation": "sine"},
+    {"width": "128"}, {"depth": "network", "offset_width": "1"}, {"activation": "leaky"},
+    {"depth": "network", "offset_activation": "sine"}, {"depth": "network", "frames": "0"},
     {"inputs": "half"}, {"inputs": "xy", "activation": "sine"}, {"output": "mask"}, {"output": "relu"},
     {"loss": "absolute"}, {"batch": "1"}, {"batch": "100000"}, {"rate": "0", "texture_rate": "0"},
-    {"rate": "1", "texture_rate": "1"}, {"beta2": "0"}, {"omega": "1000"}, {"smooth": "1"},
+    {"rate": "1", "texture_rate": "1"}, {"beta2": "0"}, {"omega": "1000"}, {"smooth": "0"},
+    {"smooth": "8"}, {"frames": "1", "features": "5"},
     {"precision": "int8"}, {"precision": "float32"}, {"pool_mb": "1"},
 ]  # fmt: skip
 

@@ -94,6 +94,19 @@ def test_group_1_the_offset_stops_growing_at_53_degrees_and_its_gradient_is_fini
         assert torch.isfinite(part).all()
 
 
+@pytest.mark.parametrize("height", [0.0, 1e-38, 30.0, 1e30, math.inf, -math.inf, math.nan])
+def test_group_1_rays_through_heights_of_any_size_end_somewhere(height):
+    found = material(heights=True, frames=2)
+    weights = {name: array.copy() for name, array in found.weights.items()}
+    weights["texture.heights"][2:4] = height
+    rng = np.random.default_rng(1)
+    view = upper(rng, 500)
+    view[:50, 2] = 0
+    wild = NeuMIP(found.spec, weights, found.header)
+    answer = wild.evaluate(rng.random((500, 2)), upper(rng, 500), view).reflectance
+    assert np.isfinite(answer).all()
+
+
 def test_group_1_below_the_horizon_is_0_and_not_an_extrapolation():
     found = material()
     low = np.array([0.6, 0.0, -0.8], np.float32)
