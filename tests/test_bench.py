@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from btfkit.bench import cases, cells, kernels, run, targets
-from btfkit.bench.cases import asked, procedural, stored
+from btfkit.bench.cases import asked, procedural, rows_of, stored
 from btfkit.btf import BTF
 from btfkit.cli import btfkit
 from btfkit.cli.outcome import run as run_cli
@@ -275,11 +275,25 @@ def test_small_pictures_hold_what_queries_find_at_their_places(shape, wrap):
 
 def test_cells_are_told_apart_by_their_keys():
     models = ("pca", "neumip", "neumip-paper")
-    found = cells.cells_of("a", models, (1.0, 2.0), seed=0, size=64)
+    found = cells.cells_of("a", models, (1.0, 2.0), seed=0, rows=64)
     assert len({cell.key for cell in found}) == len(found)
     assert sum(cell.budget_cpu_s is None for cell in found) == 6
     # Every budget of the plain models; of the variants only the longest.
     assert sum(cell.budget_cpu_s == 1.0 for cell in found) == 2
+
+
+def test_variants_go_by_the_data(tmp_path):
+    case = procedural("print", size=16, directions=3, seed=0)
+    store_write.write(case.train, tmp_path / "p.btf.zarr")
+    queryfile.write(case.queries, tmp_path / "q.npz")
+    queryfile.write(replace(case.queries, size=None, footprint=None), tmp_path / "free.npz")
+    assert [rows_of(tmp_path / name) for name in ("p.btf.zarr", "q.npz", "free.npz")] == [
+        16, 16, None,
+    ]  # fmt: skip
+    found = cells.cells_of("a", ("neumip", "pca"), (1.0,), seed=0, rows=None, pictured=False)
+    assert [cell.label for cell in found] == [
+        "neumip", "neumip offset=0", "neumip precision=int8", "pca",
+    ]  # fmt: skip
 
 
 def row(model, budget, mse, levels=(), material="m", **settings):

@@ -136,6 +136,22 @@ def name_of(source: str | Path) -> str:
     return source if isinstance(source, str) else source.name.removesuffix(".btf.zarr")
 
 
+def rows_of(path: Path) -> int | None:
+    """Rows of the grid of a store or query file; None where queries do not say."""
+    from btfkit import io
+    from btfkit.io import queryfile
+
+    if not has_queries(path):
+        return io.open(path).shape[1]
+    size = queryfile.read(path).size
+    return None if size is None else size[0]
+
+
+def has_queries(path: Path) -> bool:
+    """Whether a source is a query file, by its name."""
+    return path.suffix.lower() == ".npz"
+
+
 def _case(name: str, train: BTF, pictures: BTF) -> Case:
     train, pictures = _in_memory(train, np.float16), _in_memory(pictures, np.float32)
     queries, coarse = _levels(pictures)

@@ -66,13 +66,25 @@ class Cell:
 
 
 def cells_of(
-    material: str, models: Iterable[str], budgets: Iterable[float], *, seed: int, size: int
+    material: str,
+    models: Iterable[str],
+    budgets: Iterable[float],
+    *,
+    seed: int,
+    rows: int | None,
+    pictured: bool = True,
 ) -> list[Cell]:
-    """Every cell of a material: closed forms once a setting, trained models once a budget too."""
+    """Every cell of a material: closed forms once a setting, trained models once a budget too.
+
+    Args:
+        material: its name. models, budgets, seed: of the profile.
+        rows: of the data's grid; None where queries do not say.
+        pictured: whether the data are pictures; models that need some refuse queries only once.
+    """
     found = []
     wanted = tuple(budgets)
     for model in models:
-        for settings in _variants(model, size):
+        for settings in _variants(model, rows, pictured=pictured):
             times = wanted if model in TRAINED else (None,)
             # A variant is one more point of a curve; the longest budget says enough.
             times = times[-1:] if settings and model in TRAINED else times
@@ -90,12 +102,12 @@ def shared_cells(
     return [Cell(name, SHARED, {}, budgets[-1], seed, together) for name in materials]
 
 
-def _variants(model: str, size: int) -> tuple[dict[str, str], ...]:
-    if model == "pca":
+def _variants(model: str, rows: int | None, *, pictured: bool) -> tuple[dict[str, str], ...]:
+    if model == "pca" and pictured:
         return tuple({"rank": str(rank)} for rank in (1, 2, 4, 8, 16, 32))
     if model == "neumip":
-        smaller = {"size": str(max(size // 2, 1))}
-        return ({}, {"offset": "0"}, smaller, {"precision": "int8"})
+        smaller = ({"size": str(max(rows // 2, 1))},) if rows else ()
+        return ({}, {"offset": "0"}, *smaller, {"precision": "int8"})
     return ({},)
 
 

@@ -11,7 +11,15 @@ from typing import Any, final
 import numpy as np
 
 from btfkit.bench import kernels, plots, tables, targets
-from btfkit.bench.cases import Case, asked, name_of, procedural, stored
+from btfkit.bench.cases import (
+    Case,
+    asked,
+    has_queries,
+    name_of,
+    procedural,
+    rows_of,
+    stored,
+)
 from btfkit.bench.cells import Cell, cells_of, refusal, run_cell, run_together, shared_cells
 from btfkit.bench.machine import machine
 from btfkit.errors import BtfkitError
@@ -131,12 +139,15 @@ def cells_in(folder: Path, profile: Profile) -> list[dict[str, Any]]:
 
 def _run_missing(profile: Profile, folder: Path, progress: Progress | None) -> None:
     """Run the planned cells that are not in the folder: each material's own, then shared ones."""
-    names = [name_of(source) for source in profile.sources]
+    pictured = [s for s in profile.sources if isinstance(s, str) or not has_queries(s)]
     planned = [
-        cells_of(name, profile.models, profile.budgets_cpu_s, seed=profile.seed, size=profile.size)
-        for name in names
-    ]
-    pictured = [s for s in profile.sources if isinstance(s, str) or not _has_queries(s)]
+        cells_of(
+            name_of(source), profile.models, profile.budgets_cpu_s, seed=profile.seed,
+            rows=profile.size if isinstance(source, str) else rows_of(source),
+            pictured=source in pictured,
+        )
+        for source in profile.sources
+    ]  # fmt: skip
     together = shared_cells(
         [name_of(source) for source in pictured], profile.models, profile.budgets_cpu_s,
         seed=profile.seed,
@@ -199,12 +210,8 @@ def _case(source: str | Path, profile: Profile) -> Case:
         return procedural(
             source, size=profile.size, directions=profile.directions, seed=profile.seed
         )
-    read = asked if _has_queries(source) else stored
+    read = asked if has_queries(source) else stored
     return read(source, holdout=profile.holdout, seed=profile.seed)
-
-
-def _has_queries(path: Path) -> bool:
-    return path.suffix.lower() == ".npz"
 
 
 def _run_or_say_why(cell: Cell, case: Case) -> dict[str, Any]:
