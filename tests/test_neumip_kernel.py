@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 import torch
@@ -201,6 +203,19 @@ def test_networks_of_bfloat16_answer_as_their_twin(name, variant):
     depth = kernel.depths(weights, texels, parts[0], parts[2])
     twin = plain.depths_plain(case, weights, texels, parts[0], parts[2], networks="bfloat16")
     assert relative(depth, twin) < 1e-3
+
+
+@compiled
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_tiles_of_any_length_follow_each_other_at_once(variant):
+    case, rng = CASES["mask"], np.random.default_rng(3)
+    weights, texels = parameters(case, rng)
+    kernel = Kernel(case, variant=variant)
+    start = time.process_time()
+    for count in (1500, 257, 300):
+        kernel.evaluate(weights, texels, *queries(case, rng, count))
+    # a few milliseconds; a wait for texels of a longer tile than the last took seconds
+    assert time.process_time() - start < 1
 
 
 def test_bfloat16_is_the_nearest_number_of_eight_bits_ties_to_even():

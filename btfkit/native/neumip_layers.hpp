@@ -30,11 +30,11 @@ struct Feed {
         while (wish < wanted && queries > 0) {
             const Wish& w = wishes[wish];
             const int stop = std::min(w.list->count, at + queries);
-            queries -= stop - at;
+            queries -= std::max(stop - at, 0);
             for (; at < stop; ++at)
                 for (int c = 0; c < 4; ++c)
                     __builtin_prefetch(w.base + size_t(w.list->at[c][at]) * kChannels, 0, 2);
-            if (at == w.list->count) {
+            if (at >= w.list->count) {  // a list may have been made anew, and shorter, meanwhile
                 ++wish;
                 at = 0;
             }
