@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ import torch
 
 from btfkit.fitting import neumip_torch
 from btfkit.fitting.adam import adam_plain
-from btfkit.materials.neumip import aligned
+from btfkit.materials.base import Header
+from btfkit.materials.file import load, save
+from btfkit.materials.neumip import NeuMIP, NeuMIPSpec, aligned, in_precision, name_arrays
 from btfkit.native import neumip as native
 from btfkit.native import neumip_draw
 from btfkit.native import neumip_plain as plain
@@ -216,6 +219,47 @@ def test_tiles_of_any_length_follow_each_other_at_once(variant):
         kernel.evaluate(weights, texels, *queries(case, rng, count))
     # a few milliseconds; a wait for texels of a longer tile than the last took seconds
     assert time.process_time() - start < 1
+
+
+def of_spec(spec, seed=11):
+    header = Header(grid=spec.size)
+    case = spec.layout(header)
+    weights, texels = parameters(case, np.random.default_rng(seed))
+    return NeuMIP(spec, name_arrays(spec, case, weights, 0.3 * texels), header)
+
+
+@pytest.mark.parametrize("output", ["log", "released"])
+def test_a_model_keeps_its_networks_of_bfloat16(output, tmp_path, monkeypatch):
+    first = of_spec(NeuMIPSpec((12, 20), 3, activation="sine", output=output))
+    assert first.spec.networks == "float32"
+    half = in_precision(first, "float32", "bfloat16")
+    assert half.spec == replace(first.spec, networks="bfloat16")
+    for name, array in half.weights.items():
+        rounded = ".weight" in name and ".0." not in name
+        wanted = plain.bfloat16(first.weights[name]) if rounded else first.weights[name]
+        np.testing.assert_array_equal(array, wanted)
+    save(half, tmp_path / "half.safetensors")
+    loaded = load(tmp_path / "half.safetensors")
+    assert in_precision(loaded, "float16").spec.networks == "bfloat16"
+    rng = np.random.default_rng(12)
+    ask = rng.random((400, 2)), directions(rng, 400), directions(rng, 400), 0.7
+    answer = half.evaluate(*ask).reflectance
+    np.testing.assert_array_equal(loaded.evaluate(*ask).reflectance, answer)
+    assert 1e-5 < relative(answer, first.evaluate(*ask).reflectance) < 0.05
+    monkeypatch.setenv("BTFKIT_PLAIN", "1")
+    # as above: a few activations are rounded to the bfloat16 beside
+    assert relative(load(tmp_path / "half.safetensors").evaluate(*ask).reflectance, answer) < 2e-3
+
+
+def test_a_file_of_before_there_were_networks_of_bfloat16_loads(tmp_path):
+    model = of_spec(NeuMIPSpec((4, 5)))
+    save(model, tmp_path / "new.safetensors")
+    written = (tmp_path / "new.safetensors").read_bytes()
+    # As many bytes, so that the file stays whole.
+    old = written.replace(rb", \"networks\": \"float32\"", b" " * 27)
+    assert old != written
+    (tmp_path / "old.safetensors").write_bytes(old)
+    assert load(tmp_path / "old.safetensors").spec == model.spec
 
 
 def test_bfloat16_is_the_nearest_number_of_eight_bits_ties_to_even():
