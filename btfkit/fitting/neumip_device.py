@@ -1,4 +1,4 @@
-"""NeuMIP on a torch device: parameters, moments and batches lie there; schedule and data do not.
+"""NeuMIP on a torch device: parameters, moments and batches are there, the schedule is not.
 
 What takes the gradients is plain torch, or on CUDA the fused kernels where Triton is installed and
 knows the layout. A state goes from here to the CPU's kernels and back.
@@ -19,6 +19,7 @@ from btfkit.fitting import neumip_torch, neumip_triton
 from btfkit.fitting.loop import Trainable
 from btfkit.fitting.neumip import LEAST_BLUR, NeuMIP
 from btfkit.fitting.neumip_data import Batch
+from btfkit.fitting.neumip_device_draw import DeviceSource
 from btfkit.fitting.neumip_triton import Fused, Matrix
 from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Material
@@ -91,6 +92,7 @@ class OnDevice(Trainable):
         self._inner, self._device = inner, torch.device(device)
         self._matrix: Matrix = inner.settings.matrix  # type: ignore[assignment]
         self._engine: Eager | Fused = engine(inner.layout, self._device, matrix=self._matrix)
+        self._source = DeviceSource(inner.source, self._device)
         self.masked = inner.masked
         self._tensors = {
             name: value.to(self._device)
@@ -101,12 +103,12 @@ class OnDevice(Trainable):
 
     def step(self, progress: float) -> float:
         inner, tensors, s = self._inner, self._tensors, self._inner.settings
-        step = inner.next_step(progress)
-        self.queries = inner.queries
-        batch, target, weight = on_device(step.batch, self._device)
+        step = inner.next_step(progress, self._source.batch)
+        self.queries, batch = inner.queries, step.batch
         loss, *found = self._engine.gradients(
-            tensors["weights"], tensors["texels"], batch, target, weight, loss=s.loss
-        )
+            tensors["weights"], tensors["texels"], batch.queries, batch.target, batch.weight,
+            loss=s.loss,
+        )  # fmt: skip
         for name, rate, gradient in zip(_PARAMETERS, step.rates, found, strict=True):
             slots = (tensors[name], tensors[f"{name}.first"], tensors[f"{name}.second"])
             adam(slots, gradient, rate, step.number, (0.9, s.beta2), dense=step.dense)
@@ -145,22 +147,6 @@ class OnDevice(Trainable):
 
     def slow_down(self) -> None:
         self._inner.slow_down()
-
-
-def on_device(
-    batch: Batch, device: torch.device
-) -> tuple[neumip_triton.Batch, Tensor, Tensor | None]:
-    """A batch's queries, answers and weights as tensors on a device."""
-
-    def moved(part: Array | None) -> Tensor | None:
-        # The batch's arrays are drawn into again: a copy even where they could be shared.
-        return None if part is None else torch.from_numpy(part).to(device, copy=True)
-
-    uv, light, view, target = (
-        torch.from_numpy(part).to(device, copy=True)
-        for part in (batch.uv, batch.light, batch.view, batch.target)
-    )
-    return (uv, light, view, moved(batch.footprint)), target, moved(batch.weight)
 
 
 def adam(

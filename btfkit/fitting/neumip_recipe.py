@@ -65,6 +65,11 @@ class Recipe(Trainable, ABC):
         self._steps, self._rate = 0, 1.0
         self._arrays = self._initial(generators.numpy)
 
+    @property
+    def source(self) -> Source:
+        """Where batches come from."""
+        return self._source
+
     def _data_levels(self) -> int:
         """Levels of the data's own grid that the model's pyramid reaches to."""
         if self.spec.levels == 1:
