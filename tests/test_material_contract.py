@@ -147,6 +147,39 @@ def test_hostile_queries_are_finite_and_masked_ones_answer_nothing(model: str) -
 
 
 @every_model
+def test_how_queries_lie_in_memory_does_not_matter(model: str) -> None:
+    rng = np.random.default_rng(3)
+    uv, view = rng.random((50, 2), np.float32), upper(rng, 50).astype(np.float32)
+    light = np.float32([0.36, 0.48, 0.8])
+    wanted = fitted(model).evaluate(uv, light, view, np.float32(0.5)).reflectance
+    strided, frozen = np.zeros((50, 7), np.float32), uv.copy()
+    strided[:, 1:6:2] = view
+    frozen.setflags(write=False)
+    half = np.full((50, 1), 0.5)[:, 0]
+    for ask in (
+        (frozen, np.tile(light, (50, 1)), strided[:, 1:6:2], half, np.zeros(50)),
+        (np.asfortranarray(uv), light[None], np.asfortranarray(view), [0.5]),
+        (uv.astype(np.float64), 4 * light, view.astype(np.float64), half),
+        (uv.tolist(), light.tolist(), view.tolist()),
+    ):
+        # float32 directions that are normalised from another length
+        np.testing.assert_allclose(
+            fitted(model).evaluate(*ask).reflectance, wanted, rtol=1e-4, atol=1e-5
+        )
+
+
+@every_model
+def test_huge_places_keep_their_texel_in_float64(model: str) -> None:
+    rng = np.random.default_rng(4)
+    # a sixteenth of a tile is a texel here, and float32 knows no sixteenths beyond 2^20
+    uv = rng.integers(0, 16, (30, 2)) / 16 + 1 / 32
+    light, view = upper(rng, 30), upper(rng, 30)
+    here = fitted(model).evaluate(uv, light, view).reflectance
+    there = fitted(model).evaluate(uv + [2.0**24, -(2.0**30)], light, view).reflectance
+    np.testing.assert_array_equal(there, here)
+
+
+@every_model
 def test_grazing_directions_are_finite(model: str) -> None:
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     horizon = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
