@@ -78,6 +78,7 @@ class NeuMIP(Recipe):
             output=s.output,  # type: ignore[arg-type]
             channels=len(self._header.channels),
             precision=s.precision,  # type: ignore[arg-type]
+            networks=s.networks,  # type: ignore[arg-type]
         )
 
     def _initial(self, rng: np.random.Generator) -> dict[str, Array]:

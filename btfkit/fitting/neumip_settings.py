@@ -35,6 +35,7 @@ class Settings:
         smooth: texels by which textures are blurred every 16 steps while training begins; it
             halves five times in a run.
         precision: of the saved textures: float32, float16 or int8.
+        networks: what the fitted model is evaluated in: float32 or bfloat16.
         pool_mb: memory for textures.
         wrap: of query files, which do not say it themselves.
         matrix: what a GPU's kernels round the factors of products to: "fp32", "tf32", "bf16" or
@@ -65,6 +66,7 @@ class Settings:
     omega: float = 1.0
     smooth: float = 1.0
     precision: str = "float16"
+    networks: str = "float32"
     pool_mb: int = DEFAULT_BYTES >> 20
     wrap: str = "wrap"
     matrix: str = "bf16"
@@ -79,6 +81,7 @@ class Settings:
             "outputs": (3, 6),
             "loss": ("square", "absolute"),
             "precision": ("float32", "float16", "int8"),
+            "networks": ("float32", "bfloat16"),
             "wrap": ("wrap", "clamp"),
             "matrix": ("fp32", "tf32", "bf16", "fp16"),
         }
