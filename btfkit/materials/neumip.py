@@ -56,7 +56,7 @@ class NeuMIPSpec:
             published program: exp(YUV to RGB) - 1, times 0.1 + sigmoid.
         depth_scale: tile widths a unit of the offset network, or of the heights.
         channels: of the answer.
-        precision: of the stored textures.
+        precision: of the stored textures; heights take at least float16.
         networks: what evaluation multiplies after each network's first layer. "bfloat16" is
             faster where the processor multiplies pairs of them, and equal elsewhere but for
             rounding; these matrices are stored rounded, in float32.
@@ -151,7 +151,7 @@ class _NeuMIP(Material):
                 found[f"{name}.{k}.bias"] = (b,)
         for name, (h, w), channels in _textures(layout):
             found[name] = (h, w, channels)
-            if spec.precision == "int8":
+            if _stored_as(spec, name) == "int8":
                 found[f"{name}.range"] = (2, channels)
         return found
 
@@ -256,7 +256,7 @@ def flatten(
     texels = aligned(layout.texels)
     for view, (name, _, channels) in zip(_views(layout, texels), _textures(layout), strict=True):
         stored = weights[name]
-        if spec.precision == "int8":
+        if _stored_as(spec, name) == "int8":
             low, step = np.asarray(weights[f"{name}.range"], np.float32)
             stored = low + step * stored.astype(np.float32)
         view[..., :channels] = stored
@@ -276,15 +276,16 @@ def name_arrays(
             found[f"{name}.{k}.bias"] = bias.copy()
     for view, (name, _, channels) in zip(_views(layout, texels), _textures(layout), strict=True):
         texture = view[..., :channels]
-        if spec.precision == "int8":
+        kind = _stored_as(spec, name)
+        if kind == "int8":
             low = texture.min(axis=(0, 1))
             # A constant channel has no range: any step but 0 keeps it exact.
             step = np.maximum((texture.max(axis=(0, 1)) - low) / 255, 1e-12).astype(np.float32)
             found[f"{name}.range"] = np.stack([low, step])
             found[name] = np.rint((texture - low) / step).clip(0, 255).astype(np.uint8)
         else:
-            limit = np.finfo(spec.precision).max
-            found[name] = texture.clip(-limit, limit).astype(spec.precision)
+            limit = np.finfo(kind).max
+            found[name] = texture.clip(-limit, limit).astype(kind)
     return found
 
 
@@ -323,6 +324,12 @@ def _textures(layout: Layout) -> list[tuple[str, tuple[int, int], int]]:
     for b, bank in enumerate(layout.banks):
         found += [(f"texture.{b}.{s}", size, bank.channels) for s, size in enumerate(bank.sizes)]
     return found
+
+
+def _stored_as(spec: NeuMIPSpec, name: str) -> Precision:
+    """How a texture is stored. A ray that a step of 1/255 makes miss what it met ends far away."""
+    rough = spec.precision == "int8" and name == "texture.heights"
+    return "float16" if rough else spec.precision
 
 
 def _views(layout: Layout, texels: Array) -> list[Array]:
