@@ -15,7 +15,8 @@ import numpy as np
 from btfkit import metrics
 from btfkit.bench.machine import peak
 from btfkit.btf import BTF
-from btfkit.fitting.neumip import NeuMIP
+from btfkit.fitting.neumip import NeuMIP, spec_of
+from btfkit.fitting.neumip_settings import Settings
 from btfkit.fitting.neumip_start import initial_texels, initial_weights
 from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Header
@@ -31,20 +32,28 @@ Asked = tuple[Array, Array, Array, Array | None]
 def kernel_table(seconds: float = _SECONDS) -> list[dict[str, Any]]:
     """Rates of evaluation and of forward + backward, by size, activation and vector variant.
 
-    Network operations alone count: 2 a weight to evaluate, 6 to train; lookups come on top.
+    The published sizes throughout, and last what `neumip` fits by default. Network operations
+    alone count: 2 a weight to evaluate, 6 to train; lookups come on top.
     """
-    chosen: list[tuple[int, Activation, str]] = [
+    chosen: list[tuple[int, Activation | None, str]] = [
         (size, activation, variants()[0])
         for activation in ("relu", "sine")
         for size in (128, 512)
     ]  # fmt: skip
     chosen += [(128, "relu", name) for name in variants()[1:]]
+    chosen += [(size, None, variants()[0]) for size in (128, 512)]
     return [_one_kernel(*choice, seconds) for choice in chosen]
 
 
-def _one_kernel(size: int, activation: Activation, variant: str, seconds: float) -> dict[str, Any]:
-    layout, weights, texels = _published(size, activation, levels=size > 128)
+def _one_kernel(
+    size: int, activation: Activation | None, variant: str, seconds: float
+) -> dict[str, Any]:
+    if activation is None:
+        layout, weights, texels = _ours(size, levels=size > 128)
+    else:
+        layout, weights, texels = _published(size, activation, levels=size > 128)
     kernel = Kernel(layout, threads=1, variant=variant)
+    kernel.freeze(texels)
     ask = _asked(1 << 16, layout, mixed=size > 128)
     target = np.random.default_rng(1).random((len(ask[0]), 3), np.float32)
     work = 2 * (layout.weights - _biases(layout))
@@ -53,7 +62,7 @@ def _one_kernel(size: int, activation: Activation, variant: str, seconds: float)
     return {
         "size": size,
         "levels": "mixed" if size > 128 else "0",
-        "activation": activation,
+        "activation": activation or "neumip: " + layout.decoder.activation,
         "variant": variant,
         "evaluate_per_s": evaluate,
         "train_per_s": train,
@@ -93,7 +102,9 @@ def skip_table(seconds: float = _SECONDS, *, size: int = 512) -> list[dict[str, 
     mixed, sharp = (_asked(1 << 16, layout, mixed=mixed) for mixed in (True, False))
     count = len(mixed[0])
     flat, flat_weights, flat_texels = _published(size, "relu", levels=True, offset=False)
-    kernel, bare = Kernel(layout, threads=1), Kernel(flat, threads=1)
+    own, own_weights, own_texels = _ours(size, levels=True)
+    kernel, bare, high = (Kernel(each, threads=1) for each in (layout, flat, own))
+    high.freeze(own_texels)
     at_zero = np.full(count, 0.5, np.float32)
     lights = sharp[1][:16].copy()
     uv, _, view, _ = (None if a is None else a[: count // 16].copy() for a in sharp)
@@ -101,6 +112,7 @@ def skip_table(seconds: float = _SECONDS, *, size: int = 512) -> list[dict[str, 
     assert view is not None
     timed: dict[str, Callable[[], object]] = {
         "everything, mixed levels": lambda: kernel.evaluate(weights, texels, *mixed),
+        "heights for the offset network": lambda: high.evaluate(own_weights, own_texels, *mixed),
         "no offset stage": lambda: bare.evaluate(flat_weights, flat_texels, *mixed),
         "one level, footprints given": lambda: kernel.evaluate(
             weights, texels, *sharp[:3], at_zero
@@ -170,18 +182,33 @@ def _published(
     )
     if not offset:
         spec = replace(spec, offset=0)
-    layout = spec.layout(Header(grid=(size, size)))
+    layout, weights, texels = _untrained(spec)
+    # A depth of 0 everywhere would be kinder to the caches than a relief is.
+    if offset:
+        rng = np.random.default_rng(0)
+        texels[: size * size, :7] = 0.3 * rng.standard_normal((size * size, 7))
+    return layout, weights, texels
+
+
+def _ours(size: int, *, levels: bool) -> tuple[Layout, Array, Array]:
+    """What `neumip` fits by default, with stones 7 % of the tile high."""
+    count = most_levels((size, size)) if levels else 1
+    layout, weights, texels = _untrained(spec_of(Settings(), (size, size), count))
+    if layout.heights:
+        down, across = np.mgrid[:size, :size] * (12 * np.pi / size)
+        layout.surface(texels)[:] = 0.035 / layout.depth_scale * np.sin(down) * np.sin(across)
+    return layout, weights, texels
+
+
+def _untrained(spec: NeuMIPSpec) -> tuple[Layout, Array, Array]:
+    layout = spec.layout(Header(grid=spec.size))
     rng = np.random.default_rng(0)
     weights = np.zeros(layout.weights, np.float32)
     first, second = layout.split(weights)
     if layout.offset is not None:
         initial_weights(layout.offset[1], first, rng, 1.0)
     initial_weights(layout.decoder, second, rng, 1.0)
-    texels = initial_texels(layout, rng)
-    # A depth of 0 everywhere would be kinder to the caches than a relief is.
-    if offset:
-        texels[: size * size, :7] = 0.3 * rng.standard_normal((size * size, 7))
-    return layout, weights, texels
+    return layout, weights, initial_texels(layout, rng)
 
 
 def _biases(layout: Layout) -> int:

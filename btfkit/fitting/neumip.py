@@ -18,7 +18,7 @@ from btfkit.fitting.adam import adam_plain
 from btfkit.fitting.loop import Trainable
 from btfkit.fitting.neumip_data import Batch
 from btfkit.fitting.neumip_recipe import Recipe, torch_loss
-from btfkit.fitting.neumip_settings import INPUTS
+from btfkit.fitting.neumip_settings import INPUTS, Settings
 from btfkit.fitting.neumip_start import initial_texels, initial_weights
 from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Material
@@ -60,26 +60,7 @@ class NeuMIP(Recipe):
     material_type: ClassVar[type[Material]] = evaluated.NeuMIP
 
     def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:
-        s = self.settings
-        return NeuMIPSpec(
-            size,
-            levels,
-            features=s.features,
-            coarse=s.coarse,
-            light=s.light if s.offset else 0,
-            offset=s.offset,
-            frames=min(s.frames, s.features // 3),
-            heights=bool(s.offset) and s.depth == "heights",
-            hidden=(s.width,) * 3,
-            offset_hidden=(s.offset_width,) * 3,
-            activation=s.activation,  # type: ignore[arg-type]
-            offset_activation=s.offset_activation,  # type: ignore[arg-type]
-            directions=INPUTS[s.inputs],
-            output=s.output,  # type: ignore[arg-type]
-            channels=len(self._header.channels),
-            precision=s.precision,  # type: ignore[arg-type]
-            networks=s.networks,  # type: ignore[arg-type]
-        )
+        return spec_of(self.settings, size, levels, len(self._header.channels))
 
     def _initial(self, rng: np.random.Generator) -> dict[str, Array]:
         layout = self.layout
@@ -194,6 +175,29 @@ class NeuMIP(Recipe):
                         share = np.float32(min(variance / 2, 0.25))
                         texture += share * _laplacian(texture, axis, wrap=layout.wrap)
                 variance -= 0.5
+
+
+def spec_of(s: Settings, size: tuple[int, int], levels: int, channels: int = 3) -> NeuMIPSpec:
+    """The model that settings ask for."""
+    return NeuMIPSpec(
+        size,
+        levels,
+        features=s.features,
+        coarse=s.coarse,
+        light=s.light if s.offset else 0,
+        offset=s.offset,
+        frames=min(s.frames, s.features // 3),
+        heights=bool(s.offset) and s.depth == "heights",
+        hidden=(s.width,) * 3,
+        offset_hidden=(s.offset_width,) * 3,
+        activation=s.activation,  # type: ignore[arg-type]
+        offset_activation=s.offset_activation,  # type: ignore[arg-type]
+        directions=INPUTS[s.inputs],
+        output=s.output,  # type: ignore[arg-type]
+        channels=channels,
+        precision=s.precision,  # type: ignore[arg-type]
+        networks=s.networks,  # type: ignore[arg-type]
+    )
 
 
 def _laplacian(texture: Array, axis: int, *, wrap: bool) -> Array:

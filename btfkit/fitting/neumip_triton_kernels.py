@@ -42,6 +42,8 @@ from btfkit.fitting.neumip_triton_lookup import (
 
 # Floats of the first layer's directions and biases, of a bank's rows, of two hidden layers.
 _DIRECTIONS, _BANK, _HIDDEN = tl.constexpr(17 * 32), tl.constexpr(512), tl.constexpr(2 * 33 * 32)
+# A number that happens to be 1 stays a number of its type, and no size compiles anew.
+_NUMBERS = ["count", "height", "width", "copy_stride"]
 
 
 @triton.jit
@@ -102,7 +104,7 @@ def _features(
     return z0, directions
 
 
-@triton.jit
+@triton.jit(do_not_specialize=_NUMBERS)
 def evaluate(
     weights, texels, banks, textures, span, uv, light, view, footprint, out,
     count, height, width, aspect, depth_scale,
@@ -151,7 +153,7 @@ def evaluate(
         tl.store(out + row[:, None] * channels + column, rgb, mask=used)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=_NUMBERS)
 def gradients(
     weights, texels, banks, textures, span, uv, light, view, footprint, target, weight,
     losses, grown_weights, grown_texels,
