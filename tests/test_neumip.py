@@ -12,7 +12,7 @@ import torch
 from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import FitError
-from btfkit.fitting import loop, neumip_data, neumip_paper
+from btfkit.fitting import loop, neumip_data, neumip_levels, neumip_paper
 from btfkit.fitting import neumip as trainable
 from btfkit.fitting.fit import fit
 from btfkit.materials import file
@@ -278,10 +278,10 @@ def test_group_25_quantised_textures_stay_close():
 @pytest.mark.parametrize("side", [1, 2, 5, 64])
 def test_blurs_keep_constants_and_add_variance(side, wrap):
     for variance in (0.0, 0.1, 3.0, 400.0):
-        matrix = neumip_data.gaussian(side, variance, wrap=wrap)
+        matrix = neumip_levels.gaussian(side, variance, wrap=wrap)
         np.testing.assert_allclose(matrix.sum(axis=1), 1, atol=1e-6)
     if side == 64:
-        row = neumip_data.gaussian(side, 9.0, wrap=wrap)[32]
+        row = neumip_levels.gaussian(side, 9.0, wrap=wrap)[32]
         # Four standard deviations hold all but 1e-4 of the variance.
         assert row @ (np.arange(side) - 32.0) ** 2 == pytest.approx(9.0, rel=2e-3)
 
@@ -289,8 +289,8 @@ def test_blurs_keep_constants_and_add_variance(side, wrap):
 def test_what_is_not_measured_does_not_bleed_into_blurred_textures():
     image = np.ones((16, 16, 1), np.float32)
     image[3:5, 3:5] = np.nan
-    matrix = neumip_data.gaussian(16, 2.0, wrap=True)
-    blurred = neumip_data.blurred(image, matrix, matrix)
+    matrix = neumip_levels.gaussian(16, 2.0, wrap=True)
+    blurred = neumip_levels.blurred(image, matrix, matrix)
     np.testing.assert_allclose(blurred[np.isfinite(blurred)], 1, rtol=1e-5)
     assert np.isnan(blurred).sum() < 16
 
@@ -310,8 +310,8 @@ def test_coarse_batches_are_the_textures_blurred_by_the_contract():
         col, line = np.rint(at).astype(int)
         np.testing.assert_allclose(at, [col, line], atol=1e-4)
         variance = sigma**2 - 0.25
-        down, across = (neumip_data.gaussian(s, variance, wrap=True) for s in (16, 24))
-        truth = neumip_data.blurred(btf.texture(pair), down, across)[line, col]
+        down, across = (neumip_levels.gaussian(s, variance, wrap=True) for s in (16, 24))
+        truth = neumip_levels.blurred(btf.texture(pair), down, across)[line, col]
         # The pool is float16.
         np.testing.assert_allclose(batch.target[row], truth, rtol=2e-3, atol=1e-3)
 

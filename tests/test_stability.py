@@ -21,7 +21,8 @@ from btfkit.errors import FitError
 from btfkit.fitting import loop, losses, neumip_torch
 from btfkit.fitting.fit import fit
 from btfkit.fitting.neumip import NeuMIP as Fitted
-from btfkit.fitting.neumip_data import TexelSource, gaussian
+from btfkit.fitting.neumip_data import TexelSource
+from btfkit.fitting.neumip_levels import gaussian
 from btfkit.fitting.neumip_start import initial_texels
 from btfkit.fitting.siren import Renderer
 from btfkit.materials.base import Header

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import final
 
 import numpy as np
@@ -15,16 +13,13 @@ from numpy.typing import NDArray
 from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import FitError
+from btfkit.fitting.neumip_levels import Level, coarser
 from btfkit.fitting.pool import Pool
 from btfkit.native.neumip_draw import Draw, Images, draw
 from btfkit.native.neumip_layout import Array
 from btfkit.queries import QuerySet
 
 Progress = Callable[[int, int], None]
-# Images that are blurred for the coarser levels: enough directions, bounded time and memory.
-_MOST_BLURRED = 1024
-# Blurs a level is trained at, spread over the octave below it, so that levels between learn too.
-_BLURS = 4
 _HELD_TEXELS = 2048
 _HELD_PAIRS = 16
 
@@ -93,7 +88,8 @@ class TexelSource(Source):
         self._btf, self._test, self._seed = btf, test, seed
         self._pool = Pool(btf, train, seed=seed, most_bytes=pool_bytes, progress=progress)
         self.masked = self._pool.masked
-        self._coarse = [self._blurred(level) for level in range(1, levels)]
+        made = coarser(self._pool.images, levels, seed=seed, wrap=btf.wrap == "wrap")
+        self._coarse = [self._coarser(level) for level in made]
         self._room: tuple[Draw, Array] | None = None
 
     def batch(self, step: int, count: int) -> Batch:
@@ -169,33 +165,10 @@ class TexelSource(Source):
         edges = [0.0 if position is None else texel for position in near]
         return Images(values, phase, table[0], table[1], grid, stride, edges[0], edges[1])
 
-    def _blurred(self, level: int) -> tuple[Images, Array]:
-        """Every 2^level-th texel of some images, each blurred to a footprint of the octave."""
-        rng = np.random.default_rng([self._seed, level])
-        h, w, c = self._pool.images.shape[1:]
-        most = max(_MOST_BLURRED * 65536 // (h * w), 16)
-        count = min(len(self._pool.pairs), _MOST_BLURRED, most)
-        slots = rng.permutation(len(self._pool.pairs))[:count]
-        stride = 2**level
-        rows, cols = max(h // stride, 1), max(w // stride, 1)
-        values = np.empty((count, rows, cols, c), self._pool.images.dtype)
-        phase = np.stack(
-            [rng.integers(side - (kept - 1) * min(stride, side), size=count)
-             for side, kept in ((h, rows), (w, cols))], axis=1,
-        ).astype(np.int32)  # fmt: skip
-        # A side that a stride no longer divides keeps one texel: its phase says which.
-        blur = (0.5 * 2 ** (level - rng.integers(_BLURS, size=count) / _BLURS)).astype(np.float32)
-        wrap = self._btf.wrap == "wrap"
-        for at, slot in enumerate(slots):
-            variance = float(blur[at]) ** 2 - 0.25
-            down, across = (
-                gaussian(side, variance, wrap=wrap)[first::stride][:kept]
-                for side, first, kept in ((h, phase[at, 0], rows), (w, phase[at, 1], cols))
-            )
-            image = self._pool.images[slot].astype(np.float32)
-            values[at] = blurred(image, down, across)
-        pairs = self._pool.pairs[slots]
-        return self._with_directions(values, phase, stride, pairs, (h, w)), blur
+    def _coarser(self, level: Level) -> tuple[Images, Array]:
+        pairs, grid = self._pool.pairs[level.slots], self._btf.shape[1:3]
+        images = self._with_directions(level.values, level.phase, level.stride, pairs, grid)
+        return images, level.blur
 
 
 @final
@@ -233,37 +206,6 @@ class RowSource(Source):
 
     def held_out(self) -> Batch:
         return self._held
-
-
-@lru_cache(maxsize=8)
-def gaussian(side: int, variance: float, *, wrap: bool) -> Array:
-    """(side, side) matrix that blurs a column of texels; rows sum to 1, borders wrap or clamp.
-
-    Args:
-        side: texels. variance: of the Gaussian, texels squared.
-    """
-    if variance <= 0:
-        return np.eye(side, dtype=np.float32)
-    reach = math.ceil(4 * math.sqrt(variance))
-    steps = np.arange(-reach, reach + 1)
-    weight = np.exp(-(steps**2) / (2 * variance))
-    weight /= weight.sum()
-    matrix = np.zeros((side, side))
-    at = np.arange(side)[:, None] + steps
-    at = at % side if wrap else np.clip(at, 0, side - 1)
-    np.add.at(matrix, (np.arange(side)[:, None], at), weight)
-    return matrix.astype(np.float32)
-
-
-def blurred(image: Array, down: Array, across: Array) -> Array:
-    """down @ image @ across^T of an image (h, w, c); NaN where less than half is measured."""
-    finite = np.isfinite(image)
-    if finite.all():
-        return np.einsum("ij,jwc,kw->ikc", down, image, across, optimize=True)
-    known = np.einsum("ij,jwc,kw->ikc", down, finite.astype(np.float32), across, optimize=True)
-    filled = np.where(finite, image, np.float32(0))
-    total = np.einsum("ij,jwc,kw->ikc", down, filled, across, optimize=True)
-    return np.where(known >= 0.5, total / np.maximum(known, 1e-6), np.float32(np.nan))
 
 
 def _rows(queries: QuerySet, rows: NDArray[np.intp]) -> Batch:

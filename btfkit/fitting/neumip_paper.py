@@ -16,7 +16,8 @@ from torch import Tensor
 from btfkit.errors import FitError
 from btfkit.fitting import neumip_torch
 from btfkit.fitting.adam import adam_plain
-from btfkit.fitting.neumip_data import Batch, gaussian
+from btfkit.fitting.neumip_data import Batch
+from btfkit.fitting.neumip_levels import gaussian
 from btfkit.fitting.neumip_recipe import Recipe, tensors, torch_loss
 from btfkit.fitting.neumip_start import initial_texels
 from btfkit.materials import neumip as evaluated
