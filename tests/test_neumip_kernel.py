@@ -363,7 +363,9 @@ def test_adam_steps_as_its_twin_and_forgets_its_gradients(dense):
     twins = [[a.copy() for a in each] for each in slots]
     for step in (1, 2, 3):
         parts = queries(case, rng, 40)
-        kernel.train(weights, texels, *parts, rng.random((40, 3)).astype(np.float32))
+        # Queries of weight 0 touch texels and pull at none.
+        weight = (rng.random(40) < 0.5).astype(np.float32)
+        kernel.train(weights, texels, *parts, rng.random((40, 3)).astype(np.float32), weight)
         grown = kernel.gradients()
         kernel.adam(tuple(slots[0]), tuple(slots[1]), lr=(1e-3, 1e-2), step=step, dense=dense)
         for twin, gradient, rate in zip(twins, grown, (1e-3, 1e-2), strict=True):

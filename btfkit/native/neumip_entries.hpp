@@ -45,6 +45,18 @@ NEUMIP_TARGET void train(const Plan& plan, const float* weights, const float* te
     if (plan.offset) tile->offset.unpack(g.weights);
 }
 
+// Whether any gradient is not 0: a lookup of weight 0, or a dead network, touches and pulls not.
+FN bool pulled(float* const* g, int buffers, int64_t from, int64_t to) {
+    uint32_t bits = 0;
+    for (int t = 0; t < buffers; ++t)
+        for (int64_t i = from; i < to; ++i) {
+            uint32_t one;
+            std::memcpy(&one, g[t] + i, sizeof one);
+            bits |= one << 1;  // without the sign
+        }
+    return bits != 0;
+}
+
 // Adam on parameters [from, to) given the gradients of `buffers` threads; these are zeroed.
 // touched (buffers, ...) marks the pairs of texels that have a gradient; null: all of them.
 NEUMIP_TARGET void adam(float* p, float* m, float* v, float* const* g, uint8_t* const* touched,
@@ -60,8 +72,8 @@ NEUMIP_TARGET void adam(float* p, float* m, float* v, float* const* g, uint8_t* 
                 any |= touched[t][at / line] != 0;
                 touched[t][at / line] = 0;
             }
-        if (!any) continue;
         const int64_t end = std::min(to, at + line);
+        if (!any || (!dense && !pulled(g, buffers, at, end))) continue;
         int64_t i = at;
         for (; i + L <= end; i += L) {
             F sum = zero;
