@@ -28,7 +28,7 @@ from btfkit.fitting import loop, neumip, neumip_triton
 from btfkit.fitting.neumip_device import Eager, OnDevice
 from btfkit.fitting.neumip_triton import Fused
 from btfkit.materials.base import Header
-from btfkit.materials.neumip import NeuMIPSpec, most_levels
+from btfkit.materials.neumip_spec import NeuMIPSpec, most_levels
 from btfkit.native.neumip_layout import Layout
 from btfkit.relief import procedural
 from btfkit.relief.synth import direction_set

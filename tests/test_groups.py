@@ -34,7 +34,8 @@ from btfkit.materials.base import Header, Material
 from btfkit.materials.interpolation import Interpolation
 from btfkit.materials.lambert import Lambert, LambertSpec
 from btfkit.materials.neubtf import NeuBTF, NeuBTFSpec
-from btfkit.materials.neumip import NeuMIP, NeuMIPSpec, sizes
+from btfkit.materials.neumip import NeuMIP
+from btfkit.materials.neumip_spec import NeuMIPSpec, sizes
 
 LIGHT, VIEW = np.array([0.3, -0.2, 0.9]), np.array([-0.1, 0.4, 0.8])
 

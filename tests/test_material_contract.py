@@ -101,6 +101,37 @@ def test_shapes_broadcast(model: str) -> None:
 
 
 @every_model
+@pytest.mark.parametrize("fault", ["none", "a view below", "no number", "a light of no direction"])
+def test_lights_that_views_share_answer_as_one_by_one(model: str, fault: str) -> None:
+    material, rng = fitted(model), np.random.default_rng(3)
+    uv, view, lights = rng.random((40, 2)), upper(rng, 40), upper(rng, 5)
+    lights[1, 2] *= -1
+    if fault == "a view below":
+        view[3, 2] = -0.5
+    elif fault == "no number":
+        uv[7, 0] = np.nan
+    elif fault == "a light of no direction":
+        lights[2] = 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        together = material.evaluate(uv, lights[:, None], view)
+        alone = [material.evaluate(uv, light, view) for light in lights]
+        # As much is masked, and told, either way.
+        grid = material.evaluate(uv.reshape(1, 8, 5, 2), lights[:, None, None],
+                                 view.reshape(8, 5, 3))  # fmt: skip
+    assert together.reflectance.shape[:2] == (5, 40)
+    for light, each in enumerate(alone):
+        # Kept stages are float32 alike, but directions are normalised in another order.
+        np.testing.assert_allclose(
+            together.reflectance[light], each.reflectance, rtol=1e-4, atol=1e-5
+        )
+        np.testing.assert_array_equal(together.opacity[light], each.opacity)
+    np.testing.assert_array_equal(
+        grid.reflectance.reshape(together.reflectance.shape), together.reflectance
+    )
+
+
+@every_model
 def test_save_and_load_give_the_same_answers(model: str, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     queries = rng.random((200, 2)), upper(rng, 200), upper(rng, 200)

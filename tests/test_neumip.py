@@ -17,16 +17,9 @@ from btfkit.fitting import neumip as trainable
 from btfkit.fitting.fit import fit
 from btfkit.materials import file
 from btfkit.materials.base import Header
-from btfkit.materials.neumip import (
-    NeuMIP,
-    NeuMIPPaper,
-    NeuMIPSpec,
-    aligned,
-    in_precision,
-    most_levels,
-    name_arrays,
-    sizes,
-)
+from btfkit.materials.neumip import NeuMIP, NeuMIPPaper, in_precision
+from btfkit.materials.neumip_arrays import aligned, name_arrays
+from btfkit.materials.neumip_spec import NeuMIPSpec, most_levels, sizes
 from btfkit.native import neumip as native
 from btfkit.queries import QuerySet
 from btfkit.relief.relief import Relief

@@ -22,7 +22,8 @@ from btfkit.fitting import (
 from btfkit.fitting.adam import adam_plain
 from btfkit.fitting.fit import fit
 from btfkit.fitting.neumip_device import Eager, OnDevice, evaluate_on_device
-from btfkit.materials.neumip import NeuMIPPaper, NeuMIPSpec
+from btfkit.materials.neumip import NeuMIPPaper
+from btfkit.materials.neumip_spec import NeuMIPSpec
 from btfkit.native import neumip as native
 from btfkit.queries import QuerySet
 

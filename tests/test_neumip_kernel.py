@@ -13,7 +13,9 @@ from btfkit.fitting import neumip_torch
 from btfkit.fitting.adam import adam_plain
 from btfkit.materials.base import Header
 from btfkit.materials.file import load, save
-from btfkit.materials.neumip import NeuMIP, NeuMIPSpec, aligned, in_precision, name_arrays
+from btfkit.materials.neumip import NeuMIP, in_precision
+from btfkit.materials.neumip_arrays import aligned, name_arrays
+from btfkit.materials.neumip_spec import NeuMIPSpec
 from btfkit.native import neumip as native
 from btfkit.native import neumip_draw
 from btfkit.native import neumip_plain as plain

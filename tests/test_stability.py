@@ -27,7 +27,8 @@ from btfkit.fitting.neumip_start import initial_texels
 from btfkit.fitting.siren import Renderer
 from btfkit.materials.base import Header
 from btfkit.materials.neubtf import NeuBTFSpec
-from btfkit.materials.neumip import NeuMIP, NeuMIPSpec, in_precision
+from btfkit.materials.neumip import NeuMIP, in_precision
+from btfkit.materials.neumip_spec import NeuMIPSpec
 from btfkit.native import neumip as native
 from btfkit.native import neumip_plain as plain
 

@@ -20,7 +20,7 @@ from btfkit.fitting.neumip_settings import Settings
 from btfkit.fitting.neumip_start import initial_texels, initial_weights
 from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Header
-from btfkit.materials.neumip import NeuMIPSpec, most_levels
+from btfkit.materials.neumip_spec import NeuMIPSpec, most_levels
 from btfkit.native.neumip import Kernel, variants
 from btfkit.native.neumip_layout import Activation, Array, Layout
 from btfkit.textures import as_textures

@@ -22,7 +22,8 @@ from btfkit.fitting.neumip_settings import INPUTS, Settings
 from btfkit.fitting.neumip_start import initial_texels, initial_weights
 from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Material
-from btfkit.materials.neumip import NeuMIPSpec, aligned
+from btfkit.materials.neumip_arrays import aligned
+from btfkit.materials.neumip_spec import NeuMIPSpec
 from btfkit.native.neumip import Kernel, available
 from btfkit.native.neumip_layout import Array
 

@@ -22,7 +22,7 @@ from btfkit.fitting.neumip_recipe import Recipe, tensors, torch_loss
 from btfkit.fitting.neumip_start import initial_texels
 from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Material
-from btfkit.materials.neumip import NeuMIPSpec
+from btfkit.materials.neumip_spec import NeuMIPSpec
 from btfkit.native.neumip_layout import Array
 
 

@@ -20,8 +20,9 @@ from btfkit.fitting.neumip_data import Batch, RowSource, Source, TexelSource
 from btfkit.fitting.neumip_settings import Settings
 from btfkit.fitting.settings import parsed
 from btfkit.materials import neumip as evaluated
+from btfkit.materials import neumip_arrays
 from btfkit.materials.base import Header, Material
-from btfkit.materials.neumip import NeuMIPSpec, most_levels
+from btfkit.materials.neumip_spec import NeuMIPSpec, most_levels
 from btfkit.native.neumip_layout import Array, Layout
 from btfkit.queries import QuerySet
 
@@ -90,7 +91,7 @@ class Recipe(Trainable, ABC):
         """Weights and texels as the model would be saved now."""
 
     def material(self) -> Material:
-        arrays = evaluated.name_arrays(self.spec, self.layout, *self._current())
+        arrays = neumip_arrays.name_arrays(self.spec, self.layout, *self._current())
         return self.material_type(self.spec, arrays, self._header)
 
     def score(self) -> float:
@@ -104,7 +105,7 @@ class Recipe(Trainable, ABC):
             return math.nan
         material = evaluated.NeuMIP(
             self.spec,
-            evaluated.name_arrays(self.spec, self.layout, *self._current()),
+            neumip_arrays.name_arrays(self.spec, self.layout, *self._current()),
             self._header,
         )
         answer = answers(material, held)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from btfkit.materials.neumip import aligned
+from btfkit.materials.neumip_arrays import aligned
 from btfkit.native.neumip_layout import Array, Layout, Network
 
 
