@@ -55,7 +55,7 @@ def test_under_one_view_nothing_moves() -> None:
     choice = choose(BTF(np.ones((40, 4, 4, 3), np.float32), light, view))
     assert choice.model == "neumip"
     assert choice.settings == {"levels": "1", "offset": "0"}
-    assert "no offset stage: there is one view, nothing moves" in choice.reasons
+    assert any("no offset stage: there is one view, nothing moves" in why for why in choice.reasons)
 
 
 def test_a_flat_material_gets_no_offset_stage_and_a_deep_one_does() -> None:
