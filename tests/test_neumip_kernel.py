@@ -17,7 +17,7 @@ from btfkit.materials.neumip import NeuMIP, in_precision
 from btfkit.materials.neumip_arrays import aligned, name_arrays
 from btfkit.materials.neumip_spec import NeuMIPSpec
 from btfkit.native import neumip as native
-from btfkit.native import neumip_draw
+from btfkit.native import neumip_blur, neumip_draw
 from btfkit.native import neumip_plain as plain
 from btfkit.native.neumip import Kernel
 from btfkit.native.neumip_draw import Draw, Images
@@ -352,6 +352,22 @@ def test_equal_threads_give_equal_bytes(threads):
         results.append(kernel.gradients())
     for first, second in zip(*results, strict=True):
         np.testing.assert_array_equal(first, second)
+
+
+@compiled
+@pytest.mark.parametrize("wrap", [True, False])
+@pytest.mark.parametrize("size", [(5, 7, 8), (1, 9, 8), (6, 1, 1), (1, 1, 3), (2, 2, 8), (4, 3, 1)])
+def test_blurs_are_those_of_the_twin(size, wrap):
+    rng = np.random.default_rng(9)
+    texture = rng.standard_normal(size).astype(np.float32)
+    twin = texture.astype(np.float64)
+    for share in neumip_blur.shares(1.3):
+        neumip_blur.blur_plain(twin, share, wrap=wrap)
+    total = texture.sum(axis=(0, 1), dtype=np.float64)
+    neumip_blur.blur(texture, 1.3, wrap=wrap)
+    np.testing.assert_allclose(texture, twin, atol=2e-6)
+    if wrap:  # nothing is lost over a border that meets the other
+        np.testing.assert_allclose(texture.sum(axis=(0, 1), dtype=np.float64), total, atol=1e-4)
 
 
 @compiled

@@ -26,6 +26,8 @@ from btfkit.native.neumip_layout import Activation, Array, Layout
 from btfkit.textures import as_textures
 
 _SECONDS = 0.5
+# Whole rounds of what a loop does now and then: textures are blurred every 16 steps.
+_STEPS = 16
 Asked = tuple[Array, Array, Array, Array | None]
 
 
@@ -82,7 +84,7 @@ def loop_table(seconds: float = _SECONDS) -> list[dict[str, Any]]:
             _noise(12, size), np.arange(12), np.arange(0),
             settings=settings, generators=Generators(0),
         )  # fmt: skip
-        whole = _rate(partial(trainable.step, 0.3), batch, seconds)
+        whole = _rate(partial(_steps, trainable), _STEPS * batch, seconds)
         bare = _rate(trainable.bare_gradient(batch), batch, seconds)
         rows.append(
             {
@@ -94,6 +96,11 @@ def loop_table(seconds: float = _SECONDS) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def _steps(trainable: NeuMIP) -> None:
+    for _ in range(_STEPS):
+        trainable.step(0.3)
 
 
 def skip_table(seconds: float = _SECONDS, *, size: int = 512) -> list[dict[str, Any]]:

@@ -24,13 +24,12 @@ from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Material
 from btfkit.materials.neumip_arrays import aligned
 from btfkit.materials.neumip_spec import NeuMIPSpec
+from btfkit.native.neumip_blur import blur
 from btfkit.native.neumip import Kernel, available
 from btfkit.native.neumip_layout import Array
 
 _SMOOTH_STEPS = 16
 _SMOOTH_HALVES = 5
-# Texels squared; what is left of a blur below it changes nothing.
-LEAST_BLUR = 2e-3
 B = TypeVar("B", bound=Sized)
 
 
@@ -169,13 +168,7 @@ class NeuMIP(Recipe):
         if layout.heights:
             finest.append(layout.surface(texels)[..., None])
         for texture in finest:
-            variance = sigma**2
-            while variance > LEAST_BLUR:
-                for axis in (0, 1):
-                    if texture.shape[axis] > 1:
-                        share = np.float32(min(variance / 2, 0.25))
-                        texture += share * _laplacian(texture, axis, wrap=layout.wrap)
-                variance -= 0.5
+            blur(texture, sigma**2, wrap=layout.wrap)
 
 
 def spec_of(s: Settings, size: tuple[int, int], levels: int, channels: int = 3) -> NeuMIPSpec:
@@ -199,11 +192,3 @@ def spec_of(s: Settings, size: tuple[int, int], levels: int, channels: int = 3) 
         precision=s.precision,  # type: ignore[arg-type]
         networks=s.networks,  # type: ignore[arg-type]
     )
-
-
-def _laplacian(texture: Array, axis: int, *, wrap: bool) -> Array:
-    if wrap:
-        return np.roll(texture, 1, axis) + np.roll(texture, -1, axis) - 2 * texture
-    step = np.diff(texture, axis=axis)
-    still = np.zeros_like(texture.take([0], axis))
-    return np.concatenate([step, still], axis) - np.concatenate([still, step], axis)

@@ -17,12 +17,13 @@ from torch import Tensor
 
 from btfkit.fitting import neumip_torch, neumip_triton
 from btfkit.fitting.loop import Trainable
-from btfkit.fitting.neumip import LEAST_BLUR, NeuMIP
+from btfkit.fitting.neumip import NeuMIP
 from btfkit.fitting.neumip_data import Batch
 from btfkit.fitting.neumip_device_draw import DeviceSource
 from btfkit.fitting.neumip_triton import Fused, Matrix
 from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Material
+from btfkit.native.neumip_blur import shares
 from btfkit.native.neumip_layout import Array, Layout
 
 _PARAMETERS = ("weights", "texels")
@@ -181,13 +182,10 @@ def smooth(layout: Layout, texels: Tensor, sigma: float) -> None:
     if layout.heights:
         finest.append(layout.surface(texels)[..., None])
     for texture in finest:
-        variance = sigma**2
-        while variance > LEAST_BLUR:
+        for share in shares(sigma**2):
             for axis in (0, 1):
                 if texture.shape[axis] > 1:
-                    share = min(variance / 2, 0.25)
                     texture += share * _laplacian(texture, axis, wrap=layout.wrap)
-            variance -= 0.5
 
 
 def _laplacian(texture: Tensor, axis: int, *, wrap: bool) -> Tensor:

@@ -22,6 +22,7 @@
 #endif
 
 #include "arrays.hpp"
+#include "neumip_blur.hpp"
 #include "neumip_draw.hpp"
 #include "neumip_plan.hpp"
 #include "spread.hpp"
@@ -370,6 +371,7 @@ NB_MODULE(_neumip, m) {
         .def("adam", &Model::adam);
     m.def("draw16", &draw<uint16_t>);
     m.def("draw32", &draw<float>);
+    m.def("blur", &neumip::blur);
     m.def("variants", [] {
         std::vector<std::string> names;
         for (const auto& v : supported()) names.emplace_back(v.name);
