@@ -24,8 +24,8 @@ from btfkit.materials import neumip as evaluated
 from btfkit.materials.base import Material
 from btfkit.materials.neumip_arrays import aligned
 from btfkit.materials.neumip_spec import NeuMIPSpec
-from btfkit.native.neumip_blur import blur
 from btfkit.native.neumip import Kernel, available
+from btfkit.native.neumip_blur import blur
 from btfkit.native.neumip_layout import Array
 
 _SMOOTH_STEPS = 16
