@@ -22,7 +22,7 @@ _FLAT_TEXELS = 0.02
 _BLOCK, _SIGMA = 8, 0.7
 _MOST_VIEWS, _LIGHTS_A_VIEW = 16, 3
 # What a part that is left out would have bought: docs/benchmarks.md, skips; docs/neumip.md.
-_OFFSET = "heights would take a third of a query's time and buy nothing"
+_OFFSET = "heights would take a sixth of a query's time and buy nothing"
 _LEVELS = "coarser ones would take a third more memory and serve wider footprints alone"
 
 
