@@ -132,6 +132,16 @@ def test_lights_that_views_share_answer_as_one_by_one(model: str, fault: str) ->
 
 
 @every_model
+@pytest.mark.parametrize("name", ["uv", "light", "view"])
+def test_wrong_last_axes_are_refused_where_views_share_lights(model: str, name: str) -> None:
+    rng = np.random.default_rng(4)
+    query = {"uv": rng.random((4, 2)), "light": upper(rng, 6)[:, None], "view": upper(rng, 4)}
+    query[name] = np.ones((*query[name].shape[:-1], 5 - query[name].shape[-1]))
+    with pytest.raises(ValueError, match=f"{name} has shape"):
+        fitted(model).evaluate(**query)
+
+
+@every_model
 def test_save_and_load_give_the_same_answers(model: str, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     queries = rng.random((200, 2)), upper(rng, 200), upper(rng, 200)

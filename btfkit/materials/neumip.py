@@ -12,6 +12,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from btfkit import queries
 from btfkit.directions import normalize
 from btfkit.materials.base import Array, Header, Material
 from btfkit.materials.neumip_arrays import flatten, name_arrays, networks, stored_as, textures
@@ -66,28 +67,20 @@ class _NeuMIP(Material):
     def _answer_lights(
         self, uv: ArrayLike, light: ArrayLike, view: ArrayLike, footprint: ArrayLike
     ) -> Array | None:
-        lights = np.reshape(np.asarray(light, np.float32), (-1, 3))
-        places, seen = np.asarray(uv, np.float64), np.asarray(view, np.float32)
-        blur = np.asarray(footprint, np.float32)
-        if places.shape[-1] != 2 or seen.shape[-1] != 3 or self._kernel is None:
+        if self._kernel is None:
             return None
+        every = np.asarray(light, np.float32)
+        query, shape = queries.broadcast(uv, every[0], view, footprint)
+        lights = every.reshape(-1, 3)
         # Masked queries are counted one by one elsewhere.
-        lengths = [np.linalg.norm(d.astype(np.float64), axis=-1) for d in (seen, lights)]
-        if not (np.all(seen[..., 2] >= 0) and all(np.all(size > 1e-30) for size in lengths)):
+        lengths = [np.linalg.norm(d.astype(np.float64), axis=1) for d in (query.view, lights)]
+        if not (np.all(query.view[:, 2] >= 0) and all(np.all(size > 1e-30) for size in lengths)):
             return None
-        shape = np.broadcast_shapes(places.shape[:-1], seen.shape[:-1], blur.shape)
-        where, eyes = (
-            np.broadcast_to(part, (*shape, part.shape[-1])).reshape(-1, part.shape[-1])
-            for part in (places, seen)
-        )
         try:
-            rgb = self.evaluate_lights(
-                where, eyes, lights, np.broadcast_to(blur, shape).reshape(-1)
-            )
+            rgb = self.evaluate_lights(query.uv, query.view, lights, query.footprint)
         except ValueError:
             return None
-        full = np.broadcast_shapes((len(lights), *[1] * (np.ndim(light) - 2)), shape)
-        return rgb.reshape(*full, self.spec.channels)
+        return rgb.reshape(*np.broadcast_shapes(every.shape[:-1], shape), self.spec.channels)
 
     def evaluate_lights(
         self, uv: ArrayLike, view: ArrayLike, lights: ArrayLike, footprint: ArrayLike = 0.5
