@@ -163,12 +163,8 @@ class NeuMIP(Recipe):
 
     def _smooth(self, sigma: float) -> None:
         """Blur the finest textures: a relief is found from its large forms to its small ones."""
-        layout, texels = self.layout, self._arrays["texels"]
-        finest = [levels[0] for levels in layout.textures(texels)]
-        if layout.heights:
-            finest.append(layout.surface(texels)[..., None])
-        for texture in finest:
-            blur(texture, sigma**2, wrap=layout.wrap)
+        for texture in self.layout.finest(self._arrays["texels"]):
+            blur(texture, sigma**2, wrap=self.layout.wrap)
 
 
 def spec_of(s: Settings, size: tuple[int, int], levels: int, channels: int = 3) -> NeuMIPSpec:

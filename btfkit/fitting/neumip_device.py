@@ -178,10 +178,7 @@ def adam(
 
 def smooth(layout: Layout, texels: Tensor, sigma: float) -> None:
     """Blur the finest textures in place by `sigma` texels, as `NeuMIP` does."""
-    finest = [levels[0] for levels in layout.textures(texels)]
-    if layout.heights:
-        finest.append(layout.surface(texels)[..., None])
-    for texture in finest:
+    for texture in layout.finest(texels):
         for share in shares(sigma**2):
             for axis in (0, 1):
                 if texture.shape[axis] > 1:

@@ -22,6 +22,7 @@ from btfkit.fitting.settings import parsed
 from btfkit.materials import neumip as evaluated
 from btfkit.materials import neumip_arrays
 from btfkit.materials.base import Header, Material
+from btfkit.materials.interpolation import header_of
 from btfkit.materials.neumip_spec import NeuMIPSpec, most_levels
 from btfkit.native.neumip_layout import Array, Layout
 from btfkit.queries import QuerySet
@@ -150,13 +151,7 @@ def tensors(batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
 
 def _header(source: BTF | QuerySet, settings: Settings) -> Header:
     if isinstance(source, BTF):
-        return Header(
-            grid=source.shape[1:3],
-            channels=source.channels,
-            wrap=source.wrap,
-            texel_mm=source.texel_mm,
-            licence=source.licence,
-        )
+        return header_of(source)
     if source.size is None:
         if source.footprint is not None:
             raise FitError(

@@ -154,6 +154,11 @@ class Layout:
             found.append(levels)
         return found
 
+    def finest(self, texels: Any) -> list[Any]:
+        """(h, w, k) views of the finest level of each pyramid, and of the heights."""
+        heights = [self.surface(texels)[..., None]] if self.heights else []
+        return [levels[0] for levels in self.textures(texels)] + heights
+
     def surface(self, texels: Any) -> Any:
         """(h, w) view of the heights, units of depth_scale."""
         assert self.heights is not None
