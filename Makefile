@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-KERNELS := $(wildcard btfkit/native/*.cpp btfkit/native/*.hpp)
+KERNELS := $(wildcard btfkit/native/*.hpp btfkit/native/*/*.cpp btfkit/native/*/*.hpp)
 
 .PHONY: demo test test-quick check bench clean
 

@@ -27,9 +27,10 @@ import numpy as np
 import btfkit
 from btfkit import directions, native
 from btfkit.btf import BTF
-from btfkit.io import bonn_pack, ubo2003
-from btfkit.io.bonn_header import Meta
-from btfkit.native import factors, neumip
+from btfkit.io import ubo2003
+from btfkit.io.bonn import pack
+from btfkit.io.bonn.header import Meta
+from btfkit.native import factors, neural
 
 COMPONENTS = 64
 BATCH = 16
@@ -43,9 +44,9 @@ def bonn151(path: Path, size: int) -> Path:
     left = rng.standard_normal((3 * 151 * 151, COMPONENTS), np.float32) / COMPONENTS**0.5
     right = rng.standard_normal((size * size, COMPONENTS), np.float32)
     with path.open("wb") as file:
-        file.write(bonn_pack.head(b"!FMF12FCER", meta, angles, angles, (size, size)))
-        file.write(bonn_pack.fmf_head(log=True, most=COMPONENTS))
-        bonn_pack.write_factors(file, left, np.ones(COMPONENTS), right, scalar=2)
+        file.write(pack.head(b"!FMF12FCER", meta, angles, angles, (size, size)))
+        file.write(pack.fmf_head(log=True, most=COMPONENTS))
+        pack.write_factors(file, left, np.ones(COMPONENTS), right, scalar=2)
     return path
 
 
@@ -54,9 +55,9 @@ def hole(path: Path) -> Path:
     width, height, components = 14189, 14190, 16
     angles = np.array([[0.3, 0.1]])
     meta = Meta(version=4, cosine=True)
-    head = bonn_pack.head(b"!FMF12FCER", meta, angles, angles, (width, height))
-    head += bonn_pack.fmf_head(log=False, most=components)
-    head += bytes([2]) + bonn_pack.u32(components, 3, width * height)
+    head = pack.head(b"!FMF12FCER", meta, angles, angles, (width, height))
+    head += pack.fmf_head(log=False, most=components)
+    head += bytes([2]) + pack.u32(components, 3, width * height)
     with path.open("wb") as file:
         file.write(head)
         file.truncate(len(head) + 2 * components * (1 + 3 + width * height))
@@ -100,12 +101,12 @@ def in_turns(
 
 def peak() -> float:
     """Multiply-adds that one core can do, FLOP a second of processor time; NaN without kernels."""
-    if native.load("neumip") is None:
+    if native.load("neural") is None:
         return float("nan")
     found = []
     for _ in range(3):
         started, used = time.perf_counter(), time.process_time()
-        rate = neumip.peak(0.1)
+        rate = neural.peak(0.1)
         share = (time.process_time() - used) / (time.perf_counter() - started)
         found.append(rate / share)
     return statistics.median(found)

@@ -24,12 +24,14 @@ import torch
 
 from btfkit.btf import BTF
 from btfkit.fitting import fit as fitting
-from btfkit.fitting import loop, neumip, neumip_triton
-from btfkit.fitting.neumip_device import Eager, OnDevice
-from btfkit.fitting.neumip_triton import Fused
+from btfkit.fitting import loop
+from btfkit.fitting.neumip import trainable
+from btfkit.fitting.neumip.engines import triton
+from btfkit.fitting.neumip.engines.device import Eager, OnDevice
+from btfkit.fitting.neumip.engines.triton import Fused
 from btfkit.materials.base import Header
-from btfkit.materials.neumip_spec import NeuMIPSpec, most_levels
-from btfkit.native.neumip_layout import Layout
+from btfkit.materials.neumip.spec import NeuMIPSpec, most_levels
+from btfkit.native.neural.layout import Layout
 from btfkit.relief import procedural
 from btfkit.relief.synth import direction_set
 from btfkit.relief.trace import traced_btf
@@ -97,8 +99,8 @@ def rates(name: str, count: int, device: torch.device) -> list[dict[str, Any]]:
     texels = torch.from_numpy(rng.standard_normal((layout.texels, 8))).float().to(device)
     batch, target = batch_of(count, mixed, device)
     engines: dict[tuple[str, str, int], Eager | Fused] = {("torch", "fp32", 0): Eager(layout)}
-    if device.type == "cuda" and neumip_triton.available():
-        for matrix in neumip_triton.MATRICES:
+    if device.type == "cuda" and triton.available():
+        for matrix in triton.MATRICES:
             for block in (32, 64, 128):
                 engines["fused", matrix, block] = Fused(layout, device, matrix=matrix, block=block)
     peaks = {matrix: peak(matrix, device) for _, matrix, _ in engines}
@@ -131,7 +133,7 @@ def whole_steps(count: int, device: torch.device) -> list[dict[str, Any]]:
     for size in (128, 512):
         btf = cobbles(64)
         pairs = np.arange(len(btf))
-        inner = neumip.NeuMIP(
+        inner = trainable.NeuMIP(
             btf, pairs[8:], pairs[:8], settings={"size": str(size), "batch": str(count)},
             generators=loop.Generators(0),
         )  # fmt: skip

@@ -23,7 +23,7 @@ import btfkit
 from btfkit import metrics
 from btfkit.btf import BTF
 from btfkit.fitting import fit as fitting
-from btfkit.io import store_write
+from btfkit.io.store import writer
 from btfkit.materials import evaluation
 from btfkit.relief import procedural
 from btfkit.relief.synth import direction_set, synth_btf
@@ -60,7 +60,7 @@ class Cells:
         """The traced BTF of a material, as a store."""
         path = self.folder / f"{name}.btf.zarr"
         if not path.exists():
-            store_write.write(synth_btf(name, size=SIZE, relief_texels=relief), path)
+            writer.write(synth_btf(name, size=SIZE, relief_texels=relief), path)
         return btfkit.open(path)
 
 
@@ -122,7 +122,7 @@ def spread(btf: BTF, model: Path) -> dict[str, Any]:
 
 def scales(btf: BTF, model: Path) -> dict[str, Any]:
     """R(A(G)) shrunk against R(A(G shrunk)), decibel."""
-    from btfkit.fitting.neubtf_data import frontal_slice
+    from btfkit.fitting.neubtf.data import frontal_slice
     from btfkit.propagation import consistency
 
     train, _ = fitting.split(len(btf), HOLDOUT, SEED)
@@ -144,7 +144,7 @@ def propagation(cells: Cells, name: str, budget: float) -> None:
 
 def against_truth(whole: BTF, crop: BTF, model: Path) -> dict[str, Any]:
     """PSNR over what the fit never saw, beside that over the crop, on held-out pairs."""
-    from btfkit.fitting.neubtf_data import frontal_slice
+    from btfkit.fitting.neubtf.data import frontal_slice
     from btfkit.propagation import propagate
 
     train, test = fitting.split(len(crop), HOLDOUT, SEED)

@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 import btfkit
 from btfkit import directions, native
 from btfkit.btf import BTF
-from btfkit.io import bonn_pack, store_write
-from btfkit.io.bonn_header import Meta
+from btfkit.io.bonn import pack
+from btfkit.io.bonn.header import Meta
+from btfkit.io.store import writer
 from btfkit.textures import Index, Textures
 
 Array = NDArray[np.float32]
@@ -149,7 +150,7 @@ def write_store(path: Path, plan: Plan) -> None:
     table = directions.bonn81().astype(np.float32)[: plan.directions]
     light, view = np.tile(table, (len(table), 1)), np.repeat(table, len(table), axis=0)
     shaded = Shaded(under(light, view), surface(plan.size), plan.size, NOISE)
-    store_write.write(BTF(shaded, light, view, wrap="wrap"), path)
+    writer.write(BTF(shaded, light, view, wrap="wrap"), path)
 
 
 def write_bonn(path: Path, size: int) -> None:
@@ -162,9 +163,9 @@ def write_bonn(path: Path, size: int) -> None:
     k = len(right)
     with path.open("wb") as file:
         meta = Meta(version=4, setup="shaded from factors", cosine=True)
-        file.write(bonn_pack.head(b"!FMF12FCER", meta, angles, angles, (size, size)))
-        file.write(bonn_pack.fmf_head(log=False, most=k))
-        bonn_pack.write_factors(file, left.reshape(-1, k), np.ones(k), right.T, scalar=2)
+        file.write(pack.head(b"!FMF12FCER", meta, angles, angles, (size, size)))
+        file.write(pack.fmf_head(log=False, most=k))
+        pack.write_factors(file, left.reshape(-1, k), np.ones(k), right.T, scalar=2)
 
 
 def trial(source: Path, *, whole: int, pool_mb: int, steps: int) -> dict[str, Any]:
@@ -175,7 +176,7 @@ def trial(source: Path, *, whole: int, pool_mb: int, steps: int) -> dict[str, An
         pool_mb: memory for textures. steps: to take.
     """
     from btfkit.fitting.loop import Generators
-    from btfkit.fitting.neumip import NeuMIP
+    from btfkit.fitting.neumip.trainable import NeuMIP
     from btfkit.materials.evaluation import errors_on_btf
 
     btf = btfkit.open(source)

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from btfkit.btf import Wrap
 from btfkit.errors import FitError, FormatError
 from btfkit.files import refuse_existing
-from btfkit.fitting import augment
-from btfkit.fitting.guides import encode
-from btfkit.fitting.unet import Encoder
+from btfkit.fitting.neubtf import augment
+from btfkit.fitting.neubtf.guides import encode
+from btfkit.fitting.neubtf.unet import Encoder
 from btfkit.io import images
 from btfkit.materials import file
 from btfkit.materials.neubtf import NeuBTF

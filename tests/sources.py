@@ -12,7 +12,10 @@ import numpy as np
 
 from btfkit import directions
 from btfkit.btf import BTF
-from btfkit.io import bonn_header, bonn_pack, images, manifest, store_write, ubo2003, utia
+from btfkit.io import images, ubo2003, utia
+from btfkit.io.bonn import header, pack
+from btfkit.io.manifest import reader
+from btfkit.io.store import writer
 
 SIZE = (5, 7)
 PAIRS = 4
@@ -41,7 +44,7 @@ def png16(texture: np.ndarray) -> bytes:
 
 
 def _zarr(folder: Path) -> Path:
-    return store_write.write(small_btf(), folder / "a.btf.zarr", dtype="float32")
+    return writer.write(small_btf(), folder / "a.btf.zarr", dtype="float32")
 
 
 def _axf(folder: Path) -> Path:
@@ -50,7 +53,7 @@ def _axf(folder: Path) -> Path:
 
 
 def _manifest(folder: Path) -> Path:
-    manifest.write(small_btf(), folder / "manifest")
+    reader.write(small_btf(), folder / "manifest")
     return folder / "manifest"
 
 
@@ -142,10 +145,10 @@ def _bonn(folder: Path) -> Path:
     right = rng.integers(-3, 4, (SIZE[0] * SIZE[1], 4)) / 4
     angles = np.stack(directions.to_angles(directions.bonn81()[[8, 40]]), axis=-1)
     with (folder / "wool.btf").open("wb") as file:
-        meta = bonn_header.Meta(version=4, setup="dome", ppmm=4.0, cosine=True)
-        file.write(bonn_pack.head(b"!FMF12FCER", meta, angles, angles, SIZE[::-1]))
-        file.write(bonn_pack.fmf_head(log=True, most=4))
-        bonn_pack.write_factors(file, left, np.ones(4), right, scalar=2)
+        meta = header.Meta(version=4, setup="dome", ppmm=4.0, cosine=True)
+        file.write(pack.head(b"!FMF12FCER", meta, angles, angles, SIZE[::-1]))
+        file.write(pack.fmf_head(log=True, most=4))
+        pack.write_factors(file, left, np.ones(4), right, scalar=2)
     return folder / "wool.btf"
 
 

@@ -24,8 +24,9 @@ from btfkit.btf import BTF
 from btfkit.cli import btfkit as command
 from btfkit.cli.outcome import run
 from btfkit.errors import BtfkitError
-from btfkit.io import archive, images, store, store_write
-from btfkit.io.ingest import Part, ingest
+from btfkit.ingest import Part, ingest
+from btfkit.io import archive, images
+from btfkit.io.store import reader, writer
 from btfkit.textures import Textures
 
 READABLE = [name for name in io.FORMATS if name != "axf"]
@@ -74,7 +75,7 @@ def test_memory_does_not_grow_with_the_source(tmp_path: Path) -> None:
 def test_any_number_of_workers_writes_equal_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(store_write, "_SHARD_BYTES", 3 * 16 * 16 * 3 * 2)
+    monkeypatch.setattr(writer, "_SHARD_BYTES", 3 * 16 * 16 * 3 * 2)
     source = many(tmp_path / "source", 16, 5, 7)
     trees = []
     for jobs in (1, 2, 8):
@@ -89,9 +90,9 @@ CRASHES = """
     import json, os, shutil, signal, sys
     from pathlib import Path
     import numpy, zarr, btfkit
-    from btfkit.io import images, store_write
+    from btfkit.io import images, writer
     from btfkit.io.ingest import ingest
-    store_write._SHARD_BYTES = 3 * 16 * 16 * 3 * 2
+    writer._SHARD_BYTES = 3 * 16 * 16 * 3 * 2
     source, folder, jobs, force = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), sys.argv[4] == "force"
     out = folder / "a.btf.zarr"
     def child(work):
@@ -147,7 +148,7 @@ CRASHES = """
         # Workers may take a step less.
         assert died == 0 or os.WTERMSIG(died) == signal.SIGKILL
         if out.exists():
-            assert child(compared) == 0, f"step {k}: half a store"
+            assert child(compared) == 0, f"step {k}: half a reader"
         if force or not out.exists():
             assert child(resumed) == 0, f"step {k}"
             left = {each.name for each in folder.iterdir()}
@@ -212,8 +213,8 @@ def test_a_disk_that_fills_up_in_between_is_one_line_and_nothing_under_the_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = many(tmp_path / "source", 16, 2, 5)
-    monkeypatch.setattr(store_write, "_SHARD_BYTES", 3 * 16 * 16 * 3 * 2)
-    original, calls = store_write._sync, Counter[str]()
+    monkeypatch.setattr(writer, "_SHARD_BYTES", 3 * 16 * 16 * 3 * 2)
+    original, calls = writer._sync, Counter[str]()
 
     def full(path: Path) -> None:
         calls["sync"] += 1
@@ -221,7 +222,7 @@ def test_a_disk_that_fills_up_in_between_is_one_line_and_nothing_under_the_name(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         original(path)
 
-    monkeypatch.setattr(store_write, "_sync", full)
+    monkeypatch.setattr(writer, "_sync", full)
     out = tmp_path / "a.btf.zarr"
     arguments = ["ingest", str(source), "-o", str(out), "--jobs", "1"]
     assert run(command, arguments) == 1
@@ -230,7 +231,7 @@ def test_a_disk_that_fills_up_in_between_is_one_line_and_nothing_under_the_name(
     assert lines[0].startswith("btfkit: error: ")
     assert lines[0].endswith("No space left on device")
     assert not out.exists()
-    monkeypatch.setattr(store_write, "_sync", original)
+    monkeypatch.setattr(writer, "_sync", original)
     decoded: list[str] = []
     read = images.read
     monkeypatch.setattr(
@@ -264,12 +265,12 @@ def _six(textures: Textures) -> BTF:
 def test_a_run_that_found_half_too_small_goes_on_with_float32(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(store_write, "_SHARD_BYTES", 1)
+    monkeypatch.setattr(writer, "_SHARD_BYTES", 1)
     path = tmp_path / "a.btf.zarr"
     with pytest.raises(OSError, match="Input/output"):
-        store_write.write(_six(_Hdr(bad=4)), path, jobs=1)
+        writer.write(_six(_Hdr(bad=4)), path, jobs=1)
     again = _Hdr(bad=None)
-    store_write.write(_six(again), path, jobs=1)
+    writer.write(_six(again), path, jobs=1)
     assert again.read == [4, 5]
     assert btfkit.open(path).abrdf(0, 0)[:, 0].tolist() == [0, 1e5, 2, 3, 4, 5]
 
@@ -277,13 +278,13 @@ def test_a_run_that_found_half_too_small_goes_on_with_float32(
 def test_a_partial_store_of_other_directions_is_not_mixed_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(store_write, "_SHARD_BYTES", 1)
+    monkeypatch.setattr(writer, "_SHARD_BYTES", 1)
     path = tmp_path / "a.btf.zarr"
     with pytest.raises(OSError, match="Input/output"):
-        store_write.write(_six(_Hdr(bad=4)), path, jobs=1)
+        writer.write(_six(_Hdr(bad=4)), path, jobs=1)
     other = _Hdr(bad=None)
     aslant = np.tile([0.6, 0, 0.8], (6, 1))
-    store_write.write(BTF(other, aslant, aslant, channels=("550",)), path, jobs=1, dtype="float32")
+    writer.write(BTF(other, aslant, aslant, channels=("550",)), path, jobs=1, dtype="float32")
     assert other.read == list(range(6))
 
 
@@ -292,9 +293,9 @@ def test_two_runs_at_once_are_refused(tmp_path: Path) -> None:
 
     def again(done: int, total: int) -> None:
         with pytest.raises(BtfkitError, match="another run is writing it; wait for it or end it"):
-            store_write.write(sources.small_btf(), path)
+            writer.write(sources.small_btf(), path)
 
-    store_write.write(sources.small_btf(), path, progress=again)
+    writer.write(sources.small_btf(), path, progress=again)
     assert len(btfkit.open(path)) == 4
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.btf.zarr"]
 
@@ -312,18 +313,18 @@ def test_only_the_part_asked_for_is_decoded(
     expected = part.of(whole)
     assert len(expected) < len(whole)
     decoded: Counter[str] = Counter()
-    read, read_chunk = archive.Archive.read, store.StoreTextures._read
+    read, read_chunk = archive.Archive.read, reader.StoreTextures._read
 
     def counting(self: archive.Archive, member: str) -> bytes:
         decoded[member] += images.is_image(member) and "mask" not in member
         return read(self, member)
 
-    def counting_chunks(self: store.StoreTextures, index: int) -> np.ndarray:
+    def counting_chunks(self: reader.StoreTextures, index: int) -> np.ndarray:
         decoded[str(index)] += 1
         return read_chunk(self, index)
 
     monkeypatch.setattr(archive.Archive, "read", counting)
-    monkeypatch.setattr(store.StoreTextures, "_read", counting_chunks)
+    monkeypatch.setattr(reader.StoreTextures, "_read", counting_chunks)
     out = ingest(path, tmp_path / "part.btf.zarr", part=part, dtype="float32")
     # An image more where the first one tells the size; of a store, nothing more.
     first = name in sources.FOLDERS

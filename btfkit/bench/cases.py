@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from btfkit.btf import BTF
 from btfkit.fitting.fit import split
-from btfkit.fitting.neumip_levels import blurred, gaussian
+from btfkit.fitting.neumip.levels import blurred, gaussian
 from btfkit.materials.evaluation import texel_centres
 from btfkit.queries import QuerySet
 from btfkit.textures import as_textures

@@ -15,14 +15,14 @@ import numpy as np
 from btfkit import metrics
 from btfkit.bench.machine import peak
 from btfkit.btf import BTF
-from btfkit.fitting.neumip import NeuMIP, spec_of
-from btfkit.fitting.neumip_settings import Settings
-from btfkit.fitting.neumip_start import initial_texels, initial_weights
-from btfkit.materials import neumip as evaluated
+from btfkit.fitting.neumip.settings import Settings
+from btfkit.fitting.neumip.start import initial_texels, initial_weights
+from btfkit.fitting.neumip.trainable import NeuMIP, spec_of
 from btfkit.materials.base import Header
-from btfkit.materials.neumip_spec import NeuMIPSpec, most_levels
-from btfkit.native.neumip import Kernel, variants
-from btfkit.native.neumip_layout import Activation, Array, Layout
+from btfkit.materials.neumip import material as evaluated
+from btfkit.materials.neumip.spec import NeuMIPSpec, most_levels
+from btfkit.native.neural import Kernel, variants
+from btfkit.native.neural.layout import Activation, Array, Layout
 from btfkit.textures import as_textures
 
 _SECONDS = 0.5
@@ -139,11 +139,11 @@ def skip_table(seconds: float = _SECONDS, *, size: int = 512) -> list[dict[str, 
 def region_table(seconds: float = _SECONDS) -> list[dict[str, Any]]:
     """Reading a quarter of each texture of a store, beside reading all of it."""
     from btfkit import io
-    from btfkit.io import store_write
+    from btfkit.io.store import writer
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "noise.btf.zarr"
-        store_write.write(_noise(16, 512), path)
+        writer.write(_noise(16, 512), path)
         btf = io.open(path)
         quarter = btf.crop(slice(0, 256), slice(0, 256))
         whole, part = (_rate(partial(_read_all, source), 16, seconds) for source in (btf, quarter))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from btfkit import native
-from btfkit.native import neumip as kernels
+from btfkit.native import neural as kernels
 
 
 def machine() -> dict[str, Any]:

@@ -19,7 +19,7 @@ from btfkit.bench.cases import Case, Coarse
 from btfkit.bench.machine import peak
 from btfkit.materials.base import Material
 from btfkit.materials.evaluation import errors_on_btf, errors_on_queries
-from btfkit.native import neumip as kernels
+from btfkit.native import neural as kernels
 from btfkit.queries import QuerySet
 
 _LOOK_QUERIES = 8192

@@ -25,7 +25,7 @@ from btfkit.bench.machine import machine
 from btfkit.errors import BtfkitError
 from btfkit.files import whole
 from btfkit.fitting import MODELS
-from btfkit.native.neumip import available
+from btfkit.native.neural import available
 
 Progress = Callable[[float, float], None]
 

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 WRITERS: dict[str, str] = {
     "ubo2003": "btfkit.io.ubo2003",
     "utia": "btfkit.io.utia",
-    "btf": "btfkit.io.bonn_write",
-    "manifest": "btfkit.io.manifest",
+    "btf": "btfkit.io.bonn.write",
+    "manifest": "btfkit.io.manifest.reader",
 }
 
 

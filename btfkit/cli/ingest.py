@@ -53,7 +53,7 @@ def ingest_verb(
     a Bonn .btf, a pose manifest, an RTI .lp, and what else `btfkit info` lists.
     """
     import btfkit
-    from btfkit.io.ingest import Part, ingest
+    from btfkit.ingest import Part, ingest
 
     rows, cols = roi or (slice(None), slice(None))
     everything = slice(None)

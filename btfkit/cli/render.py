@@ -15,7 +15,7 @@ from btfkit.cli.outcome import Outcome, plain, verb
 
 if TYPE_CHECKING:
     from btfkit.materials.base import Material
-    from btfkit.render.shapes import Floats
+    from btfkit.shapes.closed import Floats
 
 _ANGLES = NumbersType("THETA,PHI", float)
 _LIGHT = (40.0, 45.0)
@@ -72,9 +72,9 @@ def render_verb(
     """
     from btfkit.files import refuse_existing
     from btfkit.render import picture
-    from btfkit.render.catalogue import shape_of
     from btfkit.render.environment import Environment
     from btfkit.render.preview import Scene, enough_samples, render
+    from btfkit.shapes.catalogue import shape_of
 
     start = time.perf_counter()
     w, h = _checked_size(size)
@@ -147,13 +147,13 @@ def _material(source: Path, *, curved: bool) -> Material:
 
     if source.suffix.lower() == ".exr":
         from btfkit.relief.file import read
-        from btfkit.render.traced import TracedRelief
+        from btfkit.relief.material import TracedRelief
 
         relief = read(source)
         return TracedRelief(relief.under_surface()[0] if curved else relief)
     if source.suffix == ".safetensors":
         return btfkit.load(source)
-    from btfkit.materials.interpolation import Interpolation
+    from btfkit.materials.measured.interpolation import Interpolation
 
     return Interpolation.of(btfkit.open(source))
 
@@ -162,7 +162,7 @@ def _at_hand(material: Material) -> Material:
     """The same material, in memory where it is a small BTF."""
     import numpy as np
 
-    from btfkit.materials.interpolation import Interpolation
+    from btfkit.materials.measured.interpolation import Interpolation
 
     lazy: Any = material.weights.get("texture")
     if not isinstance(material, Interpolation) or 4 * math.prod(lazy.shape) > _IN_MEMORY:

@@ -34,6 +34,6 @@ def material_of(path: Path) -> Material:
 
     if path.suffix == ".safetensors":
         return btfkit.load(path)
-    from btfkit.materials.interpolation import Interpolation
+    from btfkit.materials.measured.interpolation import Interpolation
 
     return Interpolation.of(btfkit.open(path))

@@ -121,9 +121,9 @@ def synth_verb(
             relief, lights=lights, views=views, samples=samples or 4, bounces=bounces, seed=seed
         )
         if kind == "zarr":
-            from btfkit.io import store_write
+            from btfkit.io.store import writer
 
-            store_write.write(btf, out, force=force, progress=bar)
+            writer.write(btf, out, force=force, progress=bar)
         else:
             from btfkit.cli.convert import written
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from btfkit.errors import BtfkitError
 from btfkit.files import refuse_existing, whole
-from btfkit.io import images, store
+from btfkit.io import images
+from btfkit.io.store import reader
 from btfkit.synthesis import Tiling
 
 Progress = Callable[[int, int], None]
@@ -43,7 +44,7 @@ def tile_file(
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     final = refuse_existing(out if out is not None else tile_name(path), force=force)
-    if path.is_dir() and store.detect(path):
+    if path.is_dir() and reader.detect(path):
         return _tile_store(path, final, force, progress), final
     if path.suffix.lower() == ".safetensors":
         return _tile_model(path, final, force), final
@@ -79,18 +80,18 @@ def _declined(path: Path) -> BtfkitError:
 def _tile_store(
     path: Path, final: Path, force: bool, progress: Callable[[int, int], None] | None
 ) -> Tiling:
-    from btfkit.io import store_write
+    from btfkit.io.store import writer
     from btfkit.synthesis import tile_btf
 
-    btf = store.read(path)
+    btf = reader.read(path)
     textures = btf.textures
-    dtype = str(textures.dtype) if isinstance(textures, store.StoreTextures) else None
+    dtype = str(textures.dtype) if isinstance(textures, reader.StoreTextures) else None
     tile, tiling = tile_btf(btf)
     try:
-        store_write.write(tile, final, dtype=dtype, force=force, progress=progress)
-    except store_write.HalfRangeError:
+        writer.write(tile, final, dtype=dtype, force=force, progress=progress)
+    except writer.HalfRangeError:
         # Taking drift away can lift a value over the end of float16.
-        store_write.write(tile, final, dtype="float32", force=force, progress=progress)
+        writer.write(tile, final, dtype="float32", force=force, progress=progress)
     return tiling
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 # Models that are trained by steps: classes that implement `loop.Trainable`.
 TRAINED: dict[str, str] = {
-    "rainer19": "btfkit.fitting.rainer:Rainer19",
-    "rainer20": "btfkit.fitting.rainer:Rainer20",
-    "neumip": "btfkit.fitting.neumip:NeuMIP",
-    "neumip-paper": "btfkit.fitting.neumip_paper:NeuMIPPaper",
-    "neubtf": "btfkit.fitting.neubtf:NeuBTF",
+    "rainer19": "btfkit.fitting.rainer.trainable:Rainer19",
+    "rainer20": "btfkit.fitting.rainer.trainable:Rainer20",
+    "neumip": "btfkit.fitting.neumip.trainable:NeuMIP",
+    "neumip-paper": "btfkit.fitting.neumip.paper:NeuMIPPaper",
+    "neubtf": "btfkit.fitting.neubtf.trainable:NeuBTF",
 }
 # Models with a closed form: functions (source, *, settings, progress) -> Material.
 CLOSED_FORM: dict[str, str] = {

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.native.neumip_layout import Array
+from btfkit.native.neural.layout import Array
 
 
 def adam_plain(

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from btfkit import native
 from btfkit.btf import BTF
 from btfkit.errors import FitError
-from btfkit.materials.pca import Domain, encoded
+from btfkit.materials.measured.pca import Domain, encoded
 
 Floats = NDArray[np.float32]
 _BLOCK_BYTES = 1 << 26

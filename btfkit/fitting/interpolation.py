@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.settings import parsed
-from btfkit.materials.blend import pair_arrays
-from btfkit.materials.interpolation import Interpolation, header_of, spec_of
+from btfkit.materials.measured.blend import pair_arrays
+from btfkit.materials.measured.interpolation import Interpolation, header_of, spec_of
 from btfkit.queries import QuerySet
 
 HALF_RANGE = 6e4

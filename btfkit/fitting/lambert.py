@@ -15,7 +15,7 @@ from btfkit.errors import FitError
 from btfkit.fitting.interpolation import images_of
 from btfkit.fitting.settings import parsed
 from btfkit.materials.base import Header
-from btfkit.materials.interpolation import header_of
+from btfkit.materials.measured.interpolation import header_of
 from btfkit.materials.lambert import Lambert, LambertSpec
 from btfkit.queries import QuerySet
 

@@ -18,9 +18,9 @@ from btfkit.errors import FormatError
 
 # The order is the order of detection: the more specific first.
 FORMATS: dict[str, str] = {
-    "zarr": "btfkit.io.store",
+    "zarr": "btfkit.io.store.reader",
     "axf": "btfkit.io.axf",
-    "manifest": "btfkit.io.manifest",
+    "manifest": "btfkit.io.manifest.reader",
     "spectral": "btfkit.io.spectral",
     "ubo2003": "btfkit.io.ubo2003",
     "utia": "btfkit.io.utia",
@@ -28,7 +28,7 @@ FORMATS: dict[str, str] = {
     "diligent": "btfkit.io.diligent",
     "lp": "btfkit.io.lp",
     "merl": "btfkit.io.merl",
-    "bonn": "btfkit.io.bonn",
+    "bonn": "btfkit.io.bonn.reader",
     "utia_brdf": "btfkit.io.utia_brdf",
 }
 

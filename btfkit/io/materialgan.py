@@ -22,7 +22,7 @@ from btfkit.errors import FormatError
 from btfkit.io import archive as archives
 from btfkit.io import images, named
 from btfkit.io.archive import Archive
-from btfkit.io.nearfield import PointLight
+from btfkit.nearfield import PointLight
 from btfkit.textures import Array
 
 _REQUIRED = ("light_pos.txt", "camera_pos.txt", "image_size.txt")

@@ -14,9 +14,10 @@ import numpy as np
 from btfkit import directions
 from btfkit.btf import BTF, RGB
 from btfkit.errors import FormatError
-from btfkit.io import anglenames, images, radiance
+from btfkit.io import anglenames, images
 from btfkit.io.anglenames import Angles
 from btfkit.io.archive import Archive
+from btfkit.io.images import radiance
 from btfkit.textures import Array, Textures
 
 Decode = Callable[[str, bytes], Array]

@@ -7,13 +7,13 @@ from typing import Any
 
 MODELS: dict[str, str] = {
     "lambert": "btfkit.materials.lambert:Lambert",
-    "interpolation": "btfkit.materials.interpolation:Interpolation",
-    "pca": "btfkit.materials.pca:PCA",
+    "interpolation": "btfkit.materials.measured.interpolation:Interpolation",
+    "pca": "btfkit.materials.measured.pca:PCA",
     "rainer19": "btfkit.materials.rainer:Rainer19",
     "rainer20": "btfkit.materials.rainer:Rainer20",
     "neubtf": "btfkit.materials.neubtf:NeuBTF",
-    "neumip": "btfkit.materials.neumip:NeuMIP",
-    "neumip-paper": "btfkit.materials.neumip:NeuMIPPaper",
+    "neumip": "btfkit.materials.neumip.material:NeuMIP",
+    "neumip-paper": "btfkit.materials.neumip.material:NeuMIPPaper",
 }
 
 

@@ -1,7 +1,7 @@
 """C++ kernels behind Python faces, each with the plain numpy twin it is tested against.
 
-A kernel `name` is one file `name.cpp`, built as the extension `btfkit.native._name`.
-Its face is `name.py`: the same function twice, `..._plain` in numpy and, where the
+A kernel is one folder `name`: `name.cpp` and its headers, built as `btfkit.native.name._name`,
+and `__init__.py`, its face: the same function twice, `..._plain` in numpy and, where the
 extension was built, the compiled one. `BTFKIT_PLAIN=1` chooses the twins.
 """
 
@@ -13,7 +13,8 @@ from types import ModuleType
 
 KERNELS: tuple[str, ...] = (
     "trace",
-    "neumip",
+    "neural",
+    "draw",
     "factors",
     "prepare",
 )
@@ -24,7 +25,7 @@ def load(name: str) -> ModuleType | None:
     if os.environ.get("BTFKIT_PLAIN", "") not in ("", "0"):
         return None
     try:
-        return importlib.import_module(f"btfkit.native._{name}")
+        return importlib.import_module(f"btfkit.native.{name}._{name}")
     except ImportError:
         return None
 

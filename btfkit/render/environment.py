@@ -7,7 +7,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.render.shapes import Floats
+from btfkit.shapes.closed import Floats
 
 
 @final

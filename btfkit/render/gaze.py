@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.materials.base import Material
-from btfkit.render.shapes import Floats, Shape, Surface
+from btfkit.shapes.closed import Floats, Shape, Surface
 
 # Interpolated normals may turn from the eye at silhouettes; a material is seen from above.
 _LOWEST_Z = 1e-3

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.materials.base import Material
-from btfkit.render.camera import Camera
 from btfkit.render.environment import Environment
 from btfkit.render.gaze import Gaze, gaze
 from btfkit.render.sampling import Samples
 from btfkit.render.shadows import Shadows
-from btfkit.render.shapes import NEAR, Floats, Meeting, Plane, Shape, Surface
+from btfkit.shapes.camera import Camera
+from btfkit.shapes.closed import NEAR, Floats, Meeting, Plane, Shape, Surface
 
 Ints = NDArray[np.intp]
 # Rays traced at once: many, since a lazy BTF decodes its textures anew for each block. Sheets that

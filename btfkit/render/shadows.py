@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from btfkit.materials.base import Material
 from btfkit.render.gaze import Gaze, gaze
-from btfkit.render.shapes import NEAR, Floats, Meeting, Plane, Shape, Surface
+from btfkit.shapes.closed import NEAR, Floats, Meeting, Plane, Shape, Surface
 
 Ints = NDArray[np.intp]
 # Sheets that light may pass; the share of light not worth following.

@@ -1,0 +1,1 @@
+"""NeuBTF while it is fitted: latents, encoder, guidance."""

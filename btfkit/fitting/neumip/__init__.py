@@ -1,0 +1,1 @@
+"""NeuMIP while it is fitted: recipes, data, and the engines that take their steps."""

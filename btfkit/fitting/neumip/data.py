@@ -1,0 +1,228 @@
+"""What NeuMIP is trained on: random texels of a bounded pool of textures, or rows of queries."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit import directions
+from btfkit.btf import BTF
+from btfkit.errors import FitError
+from btfkit.fitting.neumip.levels import Level, coarser
+from btfkit.fitting.pool import Pool
+from btfkit.native.draw import Draw, Images, draw
+from btfkit.native.neural.layout import Array
+from btfkit.queries import QuerySet
+
+Progress = Callable[[int, int], None]
+_HELD_TEXELS = 2048
+_HELD_PAIRS = 16
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """b queries with answers; footprint None is 0.5 throughout, weight None is 1."""
+
+    uv: Array
+    light: Array
+    view: Array
+    footprint: Array | None
+    target: Array
+    weight: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Share:
+    """Rows start..stop of a batch, drawn from images with `seed`; None is a blur of 0.5."""
+
+    images: Images
+    blur: Array | None
+    seed: int
+    start: int
+    stop: int
+
+
+class Source(ABC):
+    """Gives batches; what it gives at a step is decided by seed and step alone.
+
+    Attributes:
+        masked: texels or rows that are not measured.
+    """
+
+    masked: int = 0
+
+    @abstractmethod
+    def batch(self, step: int, count: int) -> Batch:
+        """`count` training queries; arrays may be reused by the next call."""
+
+    @abstractmethod
+    def held_out(self) -> Batch:
+        """A fixed part of the test set, perhaps empty."""
+
+
+@final
+class TexelSource(Source):
+    """Texels of a BTF's training pairs, level 0 sharp, coarser levels from blurred textures."""
+
+    def __init__(
+        self,
+        btf: BTF,
+        train: NDArray[np.intp],
+        test: NDArray[np.intp],
+        *,
+        levels: int,
+        seed: int,
+        pool_bytes: int,
+        progress: Progress | None = None,
+    ) -> None:
+        self._btf, self._test, self._seed = btf, test, seed
+        self._pool = Pool(btf, train, seed=seed, most_bytes=pool_bytes, progress=progress)
+        self.masked = self._pool.masked
+        made = coarser(self._pool.images, levels, seed=seed, wrap=btf.wrap == "wrap")
+        self._coarse = [self._coarser(level) for level in made]
+        self._room: tuple[Draw, Array] | None = None
+
+    def batch(self, step: int, count: int) -> Batch:
+        if self._room is None or len(self._room[1]) != count:
+            self._room = (Draw.empty(count, self._btf.shape[3]), np.full(count, 0.5, np.float32))
+        out, footprint = self._room
+        for share in self.shares(step, count):
+            part = out.part(share.start, share.stop)
+            draw(share.images, share.seed, part)
+            blur = 0.5 if share.blur is None else share.blur[part.slots]
+            footprint[share.start : share.stop] = blur
+        blurred = footprint if self._coarse else None
+        return Batch(out.uv, out.light, out.view, blurred, out.target)
+
+    @property
+    def pairs(self) -> NDArray[np.intp]:
+        """(k,) the pair of each sharp texture in memory."""
+        return self._pool.pairs
+
+    def shares(self, step: int, count: int) -> list[Share]:
+        """What a batch is drawn from: the sharp textures last."""
+        self._pool.at_step(step)
+        # Half of the queries are sharp; every further level has a quarter of the texels.
+        at, found = count, []
+        seed = int(np.random.SeedSequence([self._seed, step]).generate_state(1, np.uint64)[0])
+        seed >>= 1  # room for one number a query
+        for level, (images, blur) in enumerate(self._coarse):
+            share = max(at // 2, 1) if level == 0 else max(at // 3, 1)
+            found.append(Share(images, blur, seed ^ (level + 1) << 40, at - share, at))
+            at -= share
+        return [*found, Share(self._images(), None, seed, 0, at)]
+
+    def held_out(self) -> Batch:
+        rng = np.random.default_rng([self._seed, 7])
+        pairs = rng.permutation(self._test)[:_HELD_PAIRS]
+        h, w = self._btf.shape[1:3]
+        parts = []
+        for pair in pairs:
+            texel = rng.integers(h * w, size=min(_HELD_TEXELS, h * w))
+            row, col = np.divmod(texel, w)
+            uv = np.stack([(col + 0.5) / w, (row + 0.5) / h], axis=1).astype(np.float32)
+            light = self._btf.light_at(int(pair))[row, col]
+            view = self._btf.view_at(int(pair))[row, col]
+            parts.append((uv, light, view, self._btf.texture(int(pair))[row, col]))
+        if not parts:
+            return _nothing(self._btf.shape[3])
+        uv, light, view, rgb = (
+            np.ascontiguousarray(np.concatenate(column), np.float32)
+            for column in zip(*parts, strict=True)
+        )
+        return Batch(uv, light, view, None, rgb)
+
+    def _images(self) -> Images:
+        h, w = self._btf.shape[1:3]
+        phase = np.zeros((len(self._pool.pairs), 2), np.int32)
+        return self._with_directions(self._pool.images, phase, 1, self._pool.pairs, (h, w))
+
+    def _with_directions(
+        self,
+        values: NDArray[np.float16] | NDArray[np.float32],
+        phase: NDArray[np.int32],
+        stride: int,
+        pairs: NDArray[np.intp],
+        grid: tuple[int, int],
+    ) -> Images:
+        btf = self._btf
+        near = [btf.light_position, btf.view_position]
+        texel = btf.texel_mm or 0.0
+        table = [
+            far[pairs] if position is None else position[pairs].astype(np.float32)
+            for far, position in zip((btf.light, btf.view), near, strict=True)
+        ]
+        edges = [0.0 if position is None else texel for position in near]
+        return Images(values, phase, table[0], table[1], grid, stride, edges[0], edges[1])
+
+    def _coarser(self, level: Level) -> tuple[Images, Array]:
+        pairs, grid = self._pool.pairs[level.slots], self._btf.shape[1:3]
+        images = self._with_directions(level.values, level.phase, level.stride, pairs, grid)
+        return images, level.blur
+
+
+@final
+class RowSource(Source):
+    """Rows of a query file with their own footprints, in one shuffled order."""
+
+    def __init__(
+        self, queries: QuerySet, train: NDArray[np.intp], test: NDArray[np.intp], *, seed: int
+    ) -> None:
+        if queries.rgb is None:
+            raise FitError("these queries have no answers (no rgb): there is nothing to fit")
+        usable = queries.valid()
+        train = train[usable[train]]
+        self.masked = int(len(queries) - usable.sum())
+        if not len(train):
+            raise FitError(f"none of {len(queries)} queries is finite and seen from above")
+        rng = np.random.default_rng([seed, 11])
+        # A batch is a run of rows of this order: no gathering while training.
+        self._rows = _rows(queries, rng.permutation(train))
+        held = test[usable[test]]
+        self._held = _rows(queries, rng.permutation(held)[: _HELD_PAIRS * _HELD_TEXELS])
+        self._seed = seed
+
+    def batch(self, step: int, count: int) -> Batch:
+        rows, have = self._rows, len(self._rows)
+        if count >= have:
+            return rows
+        # Every epoch begins elsewhere, so that the same rows do not always meet.
+        a_epoch = have // count
+        epoch, turn = divmod(step, a_epoch)
+        rest = have - a_epoch * count
+        first = np.random.default_rng([self._seed, epoch]).integers(rest + 1) + turn * count
+        cut = slice(int(first), int(first) + count)
+        return _cut(rows, cut)
+
+    def held_out(self) -> Batch:
+        return self._held
+
+
+def _rows(queries: QuerySet, rows: NDArray[np.intp]) -> Batch:
+    assert queries.rgb is not None
+    unit = (directions.normalize(d[rows]).astype(np.float32) for d in (queries.light, queries.view))
+    footprint = None if queries.footprint is None else queries.footprint[rows]
+    weight = None if queries.weight is None else queries.weight[rows]
+    light, view = unit
+    return Batch(queries.uv[rows], light, view, footprint, queries.rgb[rows], weight)
+
+
+def _cut(rows: Batch, at: slice) -> Batch:
+    footprint = None if rows.footprint is None else rows.footprint[at]
+    weight = None if rows.weight is None else rows.weight[at]
+    return Batch(rows.uv[at], rows.light[at], rows.view[at], footprint, rows.target[at], weight)
+
+
+def _nothing(channels: int) -> Batch:
+    arrays = [np.empty((0, size), np.float32) for size in (2, 3, 3, channels)]
+    return Batch(arrays[0], arrays[1], arrays[2], None, arrays[3])

@@ -1,0 +1,121 @@
+"""NeuMIP's published recipe in plain torch: what ours is measured against.
+
+Source: Kuznetsov et al., "NeuMIP: Multi-Resolution Neural Materials", ACM TOG 40(4), 2021,
+sections 3 and 4, and the program released with it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from btfkit.errors import FitError
+from btfkit.fitting.neumip.engines import eager
+from btfkit.fitting.adam import adam_plain
+from btfkit.fitting.neumip.data import Batch
+from btfkit.fitting.neumip.levels import gaussian
+from btfkit.fitting.neumip.recipe import Recipe, tensors, torch_loss
+from btfkit.fitting.neumip.start import initial_texels
+from btfkit.materials.neumip import material as evaluated
+from btfkit.materials.base import Material
+from btfkit.materials.neumip.spec import NeuMIPSpec
+from btfkit.native.neural.layout import Array
+
+
+@final
+class NeuMIPPaper(Recipe):
+    """The published recipe: Adam at a constant rate, blurred textures, batches of 4 a texel."""
+
+    model: ClassVar[str] = "neumip-paper"
+    material_type: ClassVar[type[Material]] = evaluated.NeuMIPPaper
+
+    def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:
+        c = len(self._header.channels)
+        released = self.settings.outputs == 6
+        if released and c != 3:
+            raise FitError(f"the published program answers 3 channels; the data have {c}")
+        return NeuMIPSpec(
+            size,
+            levels,
+            offset=self.settings.offset,
+            output="released" if released else "relu",
+            channels=c,
+            precision=self.settings.precision,  # type: ignore[arg-type]
+        )
+
+    def _initial(self, rng: np.random.Generator) -> dict[str, Array]:
+        layout = self.layout
+        parts = []
+        for network in ([layout.offset[1]] if layout.offset else []) + [layout.decoder]:
+            flat = np.zeros(network.size, np.float32)
+            for matrix, bias in network.layers(flat):
+                # The default of torch.nn.Linear, which the published program relies on.
+                reach = 1 / math.sqrt(matrix.shape[1])
+                matrix[:] = rng.uniform(-reach, reach, matrix.shape)
+                bias[:] = rng.uniform(-reach, reach, bias.shape)
+            parts.append(flat)
+        # A last layer that begins below zero everywhere would never learn.
+        if layout.output == "relu":
+            parts[-1][-layout.channels :] = np.abs(parts[-1][-layout.channels :]) + 0.1
+        found = {"weights": np.concatenate(parts), "texels": initial_texels(layout, rng)}
+        for name, array in list(found.items()):
+            found |= {f"{name}.first": np.zeros_like(array), f"{name}.second": np.zeros_like(array)}
+        self._progress = np.zeros(1, np.float32)
+        return found | {"progress": self._progress}
+
+    def step(self, progress: float) -> float:
+        h, w = self.spec.size
+        batch = self._source.batch(self._steps, self.settings.batch or 4 * h * w)
+        self._steps += 1
+        self.queries += len(batch)
+        self._progress[0] = progress
+        weights, texels = (
+            torch.from_numpy(self._arrays[name]).requires_grad_() for name in ("weights", "texels")
+        )
+        loss = self._loss(weights, self._blurred(texels), batch)
+        found = torch.autograd.grad(loss, (weights, texels))
+        for name, gradient in zip(("weights", "texels"), found, strict=True):
+            a = self._arrays
+            slots = (a[name], a[f"{name}.first"], a[f"{name}.second"])
+            adam_plain(slots, gradient.numpy(), 1e-3 * self._rate, self._steps, (0.9, 0.999))
+        return float(loss.detach())
+
+    def _loss(self, weights: Tensor, texels: Tensor, batch: Batch) -> Tensor:
+        if self.spec.output != "released":
+            return torch_loss(self.layout, weights, texels, batch, "square")
+        raw = eager.forward(self.layout, weights, texels, *tensors(batch))
+        mixed = torch.tensor(evaluated.YUV_TO_RGB, dtype=raw.dtype)
+        rgb = torch.expm1((raw[:, :3] @ mixed.T).clamp(max=20))
+        rgb = rgb * (0.1 + torch.sigmoid(raw[:, 3:]))
+        target = torch.from_numpy(batch.target)
+        log = torch.log1p(rgb.clamp(min=-0.1))
+        square = eager.loss_of(self.layout, log, target, None, "square")
+        good = torch.isfinite(target)
+        linear = torch.where(good, (rgb - torch.where(good, target, 0.0)).abs(), 0.0).mean()
+        return square + 0.1 * linear
+
+    def _blurred(self, texels: Tensor) -> Tensor:
+        """Textures blurred by 8 texels (of the finest) at first, halved nine times in a run."""
+        sigma = 8 * 2 ** (-9 * float(self._progress[0]))
+        if sigma < 0.1:
+            return texels
+        parts = []
+        for levels in self.layout.textures(texels):
+            for s, texture in enumerate(levels):
+                h, w, _ = texture.shape
+                down, across = (
+                    torch.from_numpy(gaussian(side, (sigma / 2**s) ** 2, wrap=self.layout.wrap))
+                    for side in (h, w)
+                )
+                part = (down @ texture.reshape(h, -1)).reshape(h, w, -1)
+                parts.append((across @ part).reshape(h * w, -1))
+        return torch.cat(parts)
+
+    def _current(self) -> tuple[Array, Array]:
+        with torch.no_grad():
+            texels = self._blurred(torch.from_numpy(self._arrays["texels"]))
+        return self._arrays["weights"], texels.numpy()

@@ -1,0 +1,183 @@
+"""What both NeuMIP recipes share while they are fitted: data, shapes, flat parameters, state."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from btfkit.btf import BTF, Wrap
+from btfkit.errors import FitError
+from btfkit.fitting.neumip.engines import eager
+from btfkit.fitting.loop import Generators, Trainable
+from btfkit.fitting.neumip.data import Batch, RowSource, Source, TexelSource
+from btfkit.fitting.neumip.settings import Settings
+from btfkit.fitting.settings import parsed
+from btfkit.materials.neumip import material as evaluated
+from btfkit.materials.neumip import arrays as neumip_arrays
+from btfkit.materials.base import Header, Material
+from btfkit.materials.measured.interpolation import header_of
+from btfkit.materials.neumip.spec import NeuMIPSpec, most_levels
+from btfkit.native.neural.layout import Array, Layout
+from btfkit.queries import QuerySet
+
+# Direction pairs for which a decay of 1 is right; docs/neumip.md has the measurements.
+_DECAY_PAIRS = 60
+
+
+class Recipe(Trainable, ABC):
+    """What both recipes share: data, flat parameters, state, score."""
+
+    material_type: ClassVar[type[Material]]
+
+    def __init__(
+        self,
+        source: BTF | QuerySet,
+        train: NDArray[np.intp],
+        test: NDArray[np.intp],
+        *,
+        settings: Mapping[str, str],
+        generators: Generators,
+        progress: Any = None,
+    ) -> None:
+        self.settings = s = parsed(Settings, self.model, settings)
+        self._generators = generators
+        self._header = _header(source, s)
+        size = _texture_size(self._header.grid, s.size)
+        levels = s.levels or _levels_for(source, size)
+        self.spec = self._spec(size, min(levels, most_levels(size)))
+        self.layout = self.spec.layout(self._header)
+        self._source: Source
+        if isinstance(source, BTF):
+            self._source = TexelSource(
+                source, train, test, levels=self._data_levels(), seed=generators.seed,
+                pool_bytes=s.pool_mb << 20, progress=progress,
+            )  # fmt: skip
+        else:
+            self._source = RowSource(source, train, test, seed=generators.seed)
+        self.masked = self._source.masked
+        self._held = self._source.held_out()
+        self._decay = s.decay * min(1.0, _DECAY_PAIRS / max(len(train), 1))
+        self._steps, self._rate = 0, 1.0
+        self._arrays = self._initial(generators.numpy)
+
+    @property
+    def source(self) -> Source:
+        """Where batches come from."""
+        return self._source
+
+    def _data_levels(self) -> int:
+        """Levels of the data's own grid that the model's pyramid reaches to."""
+        if self.spec.levels == 1:
+            return 1
+        finest = math.ceil(self.layout.banks[0].shift)
+        return min(self.spec.levels + finest, most_levels(self._header.grid))
+
+    @abstractmethod
+    def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:
+        """The model's shapes for a finest texture of `size`."""
+
+    @abstractmethod
+    def _initial(self, rng: np.random.Generator) -> dict[str, Array]:
+        """Weights, texels and their moments before the first step."""
+
+    @abstractmethod
+    def _current(self) -> tuple[Array, Array]:
+        """Weights and texels as the model would be saved now."""
+
+    def material(self) -> Material:
+        arrays = neumip_arrays.name_arrays(self.spec, self.layout, *self._current())
+        return self.material_type(self.spec, arrays, self._header)
+
+    def score(self) -> float:
+        return self.scored(_by_material)
+
+    def scored(self, answers: Callable[[evaluated.NeuMIP, Batch], Array]) -> float:
+        """`score` by whatever answers the held-out queries for a material."""
+        held = self._held
+        good = np.isfinite(held.target)
+        if not good.any():
+            return math.nan
+        material = evaluated.NeuMIP(
+            self.spec,
+            neumip_arrays.name_arrays(self.spec, self.layout, *self._current()),
+            self._header,
+        )
+        answer = answers(material, held)
+        with np.errstate(invalid="ignore"):
+            error = np.log1p(np.maximum(held.target, -0.1)) - np.log1p(answer)
+        return float(np.square(error[good]).mean())
+
+    def state(self) -> dict[str, Tensor]:
+        found = {name: torch.from_numpy(array.copy()) for name, array in self._arrays.items()}
+        numbers = [self._steps, self._rate, self.queries]
+        return found | {"numbers": torch.tensor(numbers, dtype=torch.float64)}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        for name, array in self._arrays.items():
+            array[...] = state[name].numpy()
+        steps, self._rate, queries = state["numbers"].tolist()
+        self._steps, self.queries = int(steps), int(queries)
+
+    def slow_down(self) -> None:
+        self._rate *= 0.5
+
+
+def _by_material(material: evaluated.NeuMIP, held: Batch) -> Array:
+    blur = 0.5 if held.footprint is None else held.footprint
+    return material.evaluate(held.uv, held.light, held.view, blur).reflectance
+
+
+def torch_loss(layout: Layout, weights: Tensor, texels: Tensor, batch: Batch, kind: str) -> Tensor:
+    """The loss of a batch in plain torch, differentiable."""
+    raw = eager.forward(layout, weights, texels, *tensors(batch))
+    answer = eager.log_answer(layout, raw)
+    weight = None if batch.weight is None else torch.from_numpy(batch.weight)
+    return eager.loss_of(layout, answer, torch.from_numpy(batch.target), weight, kind)
+
+
+def tensors(batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """A batch as torch sees it, sharing its memory: uv, light, view, footprint."""
+    blur = None if batch.footprint is None else torch.from_numpy(batch.footprint)
+    uv, light, view = (torch.from_numpy(a) for a in (batch.uv, batch.light, batch.view))
+    return uv, light, view, blur
+
+
+def _header(source: BTF | QuerySet, settings: Settings) -> Header:
+    if isinstance(source, BTF):
+        return header_of(source)
+    if source.size is None:
+        if source.footprint is not None:
+            raise FitError(
+                "these queries have footprints but no size of the grid that they count in",
+                remedy="store size = (h, w) in the query file",
+            )
+        if not settings.size:
+            raise FitError(
+                "these queries do not say the size of the data's grid",
+                remedy="store size = (h, w) in the query file, or --set size=N",
+            )
+    wrap: Wrap = "wrap" if settings.wrap == "wrap" else "clamp"
+    grid = source.size or (settings.size, settings.size)
+    return Header(grid=grid, channels=source.channels, wrap=wrap)
+
+
+def _texture_size(grid: tuple[int, int], rows: int) -> tuple[int, int]:
+    if not rows:
+        return grid
+    return rows, max(round(rows * grid[1] / grid[0]), 1)
+
+
+def _levels_for(source: BTF | QuerySet, size: tuple[int, int]) -> int:
+    if isinstance(source, BTF):
+        return most_levels(size)
+    if source.footprint is None:
+        return 1
+    widest = float(np.nanmax(np.where(np.isfinite(source.footprint), source.footprint, 0.5)))
+    return 1 + max(math.ceil(math.log2(max(2 * widest, 1))), 0)

@@ -1,0 +1,1 @@
+"""The autoencoders of Rainer et al. while they are fitted."""

@@ -1,0 +1,289 @@
+"""The autoencoders of Rainer et al. while they are fitted; papers in `materials.rainer`.
+
+Both encode what a texel answers under many pairs, and decode it under random pairs. Rainer19's
+encoder knows the pairs by their place and serves one BTF. Rainer20's takes any list of samples
+of a whitened texel: it is trained on one or several materials, and encodes others as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from btfkit import io
+from btfkit.btf import BTF
+from btfkit.errors import FitError
+from btfkit.fitting import losses
+from btfkit.fitting.rainer.networks import Decoder, SetEncoder, TableEncoder
+from btfkit.fitting.interpolation import images_of
+from btfkit.fitting.loop import Generators, Trainable, restore_tensors, tensors_of
+from btfkit.fitting.rainer.samples import Samples
+from btfkit.fitting.settings import parsed
+from btfkit.materials import file
+from btfkit.materials import rainer as evaluated
+from btfkit.materials.measured.interpolation import header_of
+from btfkit.materials.rainer import RainerSpec
+
+# Texels encoded at once for the finished texture.
+_CHUNK = 512
+_HELD_PAIRS, _HELD_TEXELS = 24, 256
+
+
+@final
+@dataclass(frozen=True)
+class Settings:
+    """What `--set key=value` reaches.
+
+    Attributes:
+        latents: of a texel; 0 takes 8 for rainer19 and 32 for rainer20.
+        pairs, texels: a step decodes this many texels under this many pairs.
+        probes: pairs whose values the encoder sees.
+        subset: of the probes that rainer20 sees in a step.
+        rate: peak learning rate.
+        precision: of the saved codes, float16 or float32.
+        pool_mb: memory for textures.
+        materials: further sources that rainer20 learns from, separated by commas.
+        encoder: file of a fitted rainer20 to begin with; `--steps 0` then only encodes.
+    """
+
+    latents: int = 0
+    pairs: int = 32
+    texels: int = 32
+    probes: int = 128
+    subset: int = 64
+    rate: float = 2e-3
+    precision: str = "float16"
+    pool_mb: int = 1024
+    materials: str = ""
+    encoder: str = ""
+
+    def __post_init__(self) -> None:
+        if self.precision not in ("float16", "float32"):
+            raise ValueError(f"precision = {self.precision!r}; expected float16 or float32")
+        counts = (self.pairs, self.texels, self.probes, self.subset, self.pool_mb)
+        if min(counts) < 1 or self.latents < 0 or not self.rate > 0:
+            raise ValueError("pairs, texels, probes, subset, pool_mb and rate must be positive")
+
+
+class _Rainer(Trainable):
+    """What both have in common: they differ in encoder, whitening and data.
+
+    Args:
+        btf: what the material is of. train, test: its pairs.
+        others: further BTFs that rainer20 learns from, beside those that a setting names.
+    """
+
+    whitened: ClassVar[bool]
+    latents: ClassVar[int]
+    kind: ClassVar[type[evaluated.Rainer19] | type[evaluated.Rainer20]]
+
+    def __init__(
+        self,
+        btf: BTF,
+        train: NDArray[np.intp],
+        test: NDArray[np.intp],
+        *,
+        settings: Mapping[str, str],
+        generators: Generators,
+        progress: Callable[[int, int], None] | None = None,
+        others: Sequence[BTF] = (),
+    ) -> None:
+        self.settings = s = parsed(Settings, self.model, settings)
+        if not self.whitened and (s.materials or s.encoder or others):
+            raise ValueError("materials and encoder are for rainer20: rainer19 knows one BTF only")
+        btf = images_of(btf, self.model)
+        _, h, w, c = btf.shape
+        latents = s.latents or type(self).latents
+        self.spec = RainerSpec((h, w), c, latents, self.whitened)
+        self._generators = generators
+        others = self._others(btf, others)
+        sources = [(btf, train), *((b, np.arange(len(b))) for b in others)]
+        self._headers = [header_of(source) for source, _ in sources]
+        share = (s.pool_mb << 20) // len(sources)
+        self._data = [
+            Samples(
+                source, pairs, seed=generators.seed, probes=s.probes, whitened=self.whitened,
+                most_bytes=share, progress=progress,
+            )
+            for source, pairs in sources
+        ]  # fmt: skip
+        self.masked = self._data[0].masked
+        generator = generators.torch
+        self.encoder: TableEncoder | SetEncoder = (
+            SetEncoder(c, latents, generator)
+            if self.whitened
+            else TableEncoder(self._data[0].values.shape[1], c, latents, generator)
+        )
+        self.decoder = Decoder(self.spec, generator)
+        if s.encoder:
+            self._take_over(Path(s.encoder))
+        parameters = [*self.encoder.parameters(), *self.decoder.parameters()]
+        self._optimiser = torch.optim.Adam(parameters, lr=0.0, betas=(0.9, 0.99), fused=True)
+        self._steps, self._rate = 0, 1.0
+        self._hold(btf, test)
+
+    def _others(self, btf: BTF, given: Sequence[BTF]) -> list[BTF]:
+        named = [io.open(name) for name in self.settings.materials.split(",") if name]
+        found = [images_of(other, self.model) for other in (*given, *named)]
+        for other in found:
+            if other.channels != btf.channels:
+                raise FitError(f"channels {other.channels} beside {btf.channels}: they must agree")
+        return found
+
+    def _take_over(self, path: Path) -> None:
+        """Begin with the networks of a fitted model."""
+        fitted = file.load(path)
+        if not isinstance(fitted, self.kind) or (
+            (fitted.spec.latents, fitted.spec.channels) != (self.spec.latents, self.spec.channels)
+        ):
+            raise FitError(
+                f"{path} is a {fitted.model} of {fitted.spec}; expected {self.model} with "
+                f"{self.spec.latents} latents and {self.spec.channels} channels"
+            )
+        arrays = file.training_arrays(path)
+        self.encoder.load_state_dict(
+            {k.removeprefix("encoder."): torch.from_numpy(v.copy()) for k, v in arrays.items()}
+        )
+        for name, tensor in self.decoder.arrays().items():
+            tensor.copy_(torch.from_numpy(np.array(fitted.weights[name])))
+
+    def _hold(self, btf: BTF, test: NDArray[np.intp]) -> None:
+        """A fixed, small sample of the held-out pairs that scores the model."""
+        rng = np.random.default_rng(0)
+        _, h, w, _ = btf.shape
+        self._held_pairs = rng.permutation(test)[:_HELD_PAIRS]
+        self._held_texels = torch.from_numpy(rng.integers(h * w, size=_HELD_TEXELS))
+        rows, cols = np.divmod(self._held_texels.numpy(), w)
+        self._held = [torch.from_numpy(btf.texture(int(p))[rows, cols]) for p in self._held_pairs]
+
+    # --- the loop's side -------------------------------------------------------------------
+
+    def step(self, progress: float) -> float:
+        s, generator = self.settings, self._generators.torch
+        which = int(torch.randint(len(self._data), (1,), generator=generator))
+        data = self._data[which]
+        data.at_step(self._steps)
+        self._steps += 1
+        texels = torch.randint(data.texels, (min(s.texels, data.texels),), generator=generator)
+        probes = None
+        if self.whitened:
+            count = min(s.subset, data.values.shape[1])
+            probes = torch.randperm(data.values.shape[1], generator=generator)[:count]
+        slots = torch.randint(data.slots, (s.pairs,), generator=generator)
+        pairs = data.pairs_of(slots)
+        predicted = self._predict(data, self._encoded(data, texels, probes), pairs, texels)
+        loss = losses.log_l1(predicted, data.targets(slots, texels))
+        self.queries += len(slots) * len(texels)
+        warm_up = min(1.0, (progress + 1e-4) / 0.05)
+        factor = self._rate * warm_up * (0.5 + 0.5 * math.cos(math.pi * progress)) + 1e-3
+        for group in self._optimiser.param_groups:
+            group["lr"] = s.rate * factor
+        self._optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self._optimiser.param_groups[0]["params"], 1.0, foreach=True)
+        self._optimiser.step()
+        return float(loss.detach())
+
+    def slow_down(self) -> None:
+        self._rate *= 0.5
+
+    def score(self) -> float:
+        if not self._held:
+            return math.nan
+        data = self._data[0]
+        with torch.no_grad():
+            codes = self._encoded(data, self._held_texels, None)
+            predicted = self._predict(data, codes, self._held_pairs, self._held_texels)
+        target = torch.stack(self._held)
+        measured = torch.isfinite(target)
+        wanted = torch.log1p(torch.where(measured, target, 0.0).clamp_min(-0.1))
+        error = torch.where(measured, predicted - wanted, 0.0).square()
+        return float(error.sum() / measured.sum().clamp_min(1))
+
+    def material(self, which: int = 0) -> evaluated.Rainer19 | evaluated.Rainer20:
+        """The BTF itself, or another one that the networks learn from: its codes."""
+        data, header = self._data[which], self._headers[which]
+        h, w = header.grid
+        with torch.no_grad():
+            codes = torch.cat(
+                [
+                    self._encoded(data, torch.arange(start, min(start + _CHUNK, h * w)), None)
+                    for start in range(0, h * w, _CHUNK)
+                ]
+            )
+        weights: dict[str, Any] = {
+            name: tensor.numpy().copy() for name, tensor in self.decoder.arrays().items()
+        }
+        limit = float(np.finfo(self.settings.precision).max)
+        textures = {"texture": codes}
+        if self.whitened:
+            textures["texture.whitening"] = torch.cat([data.mean, data.deviation], dim=1)
+        for name, texture in textures.items():
+            bounded = texture.numpy().reshape(h, w, -1).clip(-limit, limit)
+            weights[name] = bounded.astype(self.settings.precision)
+        return self.kind(replace(self.spec, size=header.grid), weights, header)
+
+    def training_arrays(self) -> dict[str, NDArray[Any]]:
+        """The universal encoder; nothing where the encoder serves this BTF alone."""
+        if not self.whitened:
+            return {}
+        named = self.encoder.state_dict()
+        return {f"encoder.{name}": value.numpy().copy() for name, value in named.items()}
+
+    def state(self) -> dict[str, Tensor]:
+        found = tensors_of(self._modules(), {"moments": self._optimiser})
+        numbers = [self._steps, self._rate, self.queries]
+        return found | {"numbers": torch.tensor(numbers, dtype=torch.float64)}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        restore_tensors(state, self._modules(), {"moments": self._optimiser})
+        steps, rate, queries = state["numbers"].tolist()
+        self._steps, self._rate, self.queries = int(steps), rate, int(queries)
+
+    def _modules(self) -> dict[str, nn.Module]:
+        return {"encoder": self.encoder, "decoder": self.decoder}
+
+    # --- encoding and decoding -------------------------------------------------------------
+
+    def _encoded(self, data: Samples, texels: Tensor, probes: Tensor | None) -> Tensor:
+        """(t, latents) codes of texels, from some or all probes."""
+        values, light, view = data.probed(texels, probes)
+        return self.encoder(values, light, view)
+
+    def _predict(
+        self, data: Samples, codes: Tensor, pairs: NDArray[np.intp], texels: Tensor
+    ) -> Tensor:
+        """(k, t, c) log(1 + value) of texels (t,) under pairs (k,)."""
+        light, view = data.directions(pairs, texels)
+        answer = self.decoder(codes, light, view)
+        if self.whitened:
+            answer = data.mean[texels] + data.deviation[texels] * answer
+        return answer
+
+
+@final
+class Rainer19(_Rainer):
+    """An autoencoder of the texels of one BTF."""
+
+    model: ClassVar[str] = "rainer19"
+    whitened: ClassVar[bool] = False
+    latents: ClassVar[int] = 8
+    kind = evaluated.Rainer19
+
+
+@final
+class Rainer20(_Rainer):
+    """An autoencoder of whitened texels of any BTF."""
+
+    model: ClassVar[str] = "rainer20"
+    whitened: ClassVar[bool] = True
+    latents: ClassVar[int] = 32
+    kind = evaluated.Rainer20

@@ -1,0 +1,154 @@
+"""From any readable source to one native store, with a record of where it came from."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import os
+import platform
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, final
+
+from btfkit import io
+from btfkit.btf import BTF
+from btfkit.files import refuse_existing
+from btfkit.io.store import reader as store
+from btfkit.io.store import writer
+
+# Files up to this size are hashed whole; of larger ones the two ends and the size.
+_HASH_WHOLE = 1 << 30
+
+
+@final
+@dataclass(frozen=True)
+class Part:
+    """Which part of a source is read; nothing else is decoded.
+
+    Attributes:
+        rows, cols: window in texels.
+        lights, views: over the distinct directions in the order of first appearance.
+    """
+
+    rows: slice = field(default_factory=lambda: slice(None))
+    cols: slice = field(default_factory=lambda: slice(None))
+    lights: slice = field(default_factory=lambda: slice(None))
+    views: slice = field(default_factory=lambda: slice(None))
+
+    def of(self, btf: BTF) -> BTF:
+        """This part of `btf`, lazily."""
+        if self.lights != slice(None) or self.views != slice(None):
+            btf = btf.select(lights=self.lights, views=self.views)
+        return btf.crop(self.rows, self.cols)
+
+
+def store_name(source: str | os.PathLike[str]) -> Path:
+    """The store that a source becomes by default: `folder` -> `folder.btf.zarr`, here."""
+    name = Path(source).resolve().name
+    for suffix in (".btf.zarr", ".btf", ".zip", ".json", ".csv", ".lp", ".bin", ".binary"):
+        if name.lower().endswith(suffix) and len(name) > len(suffix):
+            name = name[: -len(suffix)]
+            break
+    return Path(f"{name}.btf.zarr")
+
+
+def ingest(
+    source: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None = None,
+    *,
+    format: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    part: Part | None = None,
+    dtype: str | None = None,
+    jobs: int | None = None,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Read a source in any known format and write a native store.
+
+    Args:
+        source: folder, zip, file or manifest.
+        out: the store; None takes `store_name(source)`.
+        format: a name of `io.FORMATS`; None detects it.
+        options: what the format leaves open, as its reader names it; None values are left out.
+        part: which part is read.
+        dtype, jobs, force, progress: as in `io.store.writer.write`.
+
+    Returns:
+        The path of the store.
+
+    Raises:
+        FormatError: damaged or unknown source.
+        FileExistsError: `out` exists and `force` is False.
+    """
+    final = refuse_existing(out if out is not None else store_name(source), force=force)
+    name = format or io.detect(source)
+    given = {key: value for key, value in (options or {}).items() if value is not None}
+    settled = {"texel_mm": given.pop("texel_mm")} if _outside(name, given, "texel_mm") else {}
+    btf = replace(io.open(source, format=name, **given), **settled)
+    taken = part or Part()
+    btf = taken.of(btf)
+    provenance = {
+        **btf.provenance,
+        "source": os.fspath(source),
+        "format": name,
+        "hash": source_hash(Path(source)),
+        "options": {**given, **settled, **_part_record(taken)},
+        "versions": {
+            "btfkit": importlib.metadata.version("btfkit"),
+            "python": platform.python_version(),
+        },
+    }
+    history = (*btf.history, f"ingested from {name}")
+    record = replace(btf, provenance=provenance, history=history)
+    path = writer.write(record, final, dtype=dtype, jobs=jobs, force=force, progress=progress)
+    masked = store.masked_texels(path)
+    if masked:
+        n, h, w, _ = btf.shape
+        warnings.warn(
+            f"{os.fspath(source)}: {masked} of {n * h * w} texels are not finite; they are masked",
+            stacklevel=2,
+        )
+    return path
+
+
+def source_hash(source: Path) -> dict[str, Any]:
+    """SHA-256 that tells a source from another, and what it was taken of.
+
+    A file is hashed whole up to 1 GiB, beyond that by its ends and size; a folder by the
+    names and sizes of its files.
+    """
+    digest = hashlib.sha256()
+    if source.is_dir():
+        files = sorted(p for p in source.rglob("*") if p.is_file())
+        for each in files:
+            entry = f"{each.relative_to(source).as_posix()}\0{each.stat().st_size}\n"
+            digest.update(entry.encode("utf-8", "surrogateescape"))
+        return {"sha256": digest.hexdigest(), "of": "names and sizes", "files": len(files)}
+    size = source.stat().st_size
+    with source.open("rb") as file:
+        if size <= _HASH_WHOLE:
+            for block in iter(lambda: file.read(1 << 20), b""):
+                digest.update(block)
+            return {"sha256": digest.hexdigest(), "of": "contents", "bytes": size}
+        digest.update(file.read(1 << 26))
+        file.seek(-(1 << 26), os.SEEK_END)
+        digest.update(file.read())
+        digest.update(str(size).encode())
+    return {"sha256": digest.hexdigest(), "of": "first and last 64 MiB, size", "bytes": size}
+
+
+def _outside(format: str, given: Mapping[str, Any], option: str) -> bool:
+    """Whether an option is given that every BTF has and this format's reader does not take."""
+    return option in given and option not in io.options_of(format)
+
+
+def _part_record(part: Part) -> dict[str, list[int | None]]:
+    slices = {"rows": part.rows, "cols": part.cols, "lights": part.lights, "views": part.views}
+    return {
+        name: [chosen.start, chosen.stop, chosen.step]
+        for name, chosen in slices.items()
+        if chosen != slice(None)
+    }

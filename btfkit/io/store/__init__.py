@@ -1,0 +1,1 @@
+"""The native store `*.btf.zarr`: its reader and its writer."""

@@ -1,0 +1,1 @@
+"""Materials that are the measurement itself: answers are blended from measured pairs."""

@@ -1,0 +1,1 @@
+"""NeuMIP as it is used: spec, arrays, evaluation."""

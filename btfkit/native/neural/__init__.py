@@ -1,0 +1,204 @@
+"""NeuMIP's kernels: the compiled form of a layout's evaluation, and its training."""
+
+from __future__ import annotations
+
+from typing import Literal, final
+
+import numpy as np
+
+from btfkit import native
+from btfkit.native.neural.layout import (
+    ACTIVATIONS,
+    CHANNELS,
+    DIRECTIONS,
+    OUTPUTS,
+    Array,
+    Layout,
+    Network,
+    Networks,
+)
+
+Loss = Literal["square", "absolute"]
+
+
+@final
+class Kernel:
+    """The compiled form of one layout: the same answers, and training.
+
+    Gradients of `train` add up here, a buffer a thread, until `adam` uses and zeroes them.
+    Equal threads and variant give equal results. `networks` is what evaluation multiplies, as in
+    `evaluate_plain`; training is float32.
+
+    Raises:
+        RuntimeError: the extension was not built; see `available`.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        *,
+        variant: str = "",
+        threads: int | None = None,
+        networks: Networks = "float32",
+    ) -> None:
+        module = native.load("neural")
+        if module is None:
+            raise RuntimeError("the NeuMIP kernel was not built; use evaluate_plain")
+        self._threads = native.threads() if threads is None else threads
+        self._variant = variant
+        textures: list[list[int]] = []
+        banks: list[list[float]] = []
+        at = layout.texels - sum(pyramid.texels for pyramid in layout.pyramids)
+        for pyramid in layout.pyramids:
+            first = len(textures)
+            for h, w in pyramid.sizes:
+                textures.append([h, w, at])
+                at += h * w
+            count = len(pyramid.sizes)
+            moves = (pyramid.view, pyramid.light, pyramid.shift)
+            banks.append([float(pyramid.channels), float(first), float(count), *moves])
+        offset = layout.offset[1] if layout.offset else Network((1, 1), ())
+        self._model = module.Model(
+            layout.wrap,
+            layout.aspect,
+            layout.depth_scale,
+            OUTPUTS.index(layout.output),
+            layout.channels,
+            layout.frames,
+            textures,
+            banks,
+            layout.offset is not None,
+            list(layout.heights or ()),
+            *_network(offset),
+            *_network(layout.decoder),
+            networks == "bfloat16",
+        )
+        self._layout = layout
+
+    def freeze(self, texels: Array) -> None:
+        """Promise that every later call gets these texels: what depends on them is kept."""
+        self._model.freeze(texels)
+
+    def evaluate(
+        self,
+        weights: Array,
+        texels: Array,
+        uv: Array,
+        light: Array,
+        view: Array,
+        footprint: Array | None = None,
+        *,
+        raw: bool = False,
+    ) -> Array:
+        """As `evaluate_plain`; every array float32 and contiguous."""
+        outputs = self._layout.decoder.widths[-1] if raw else self._layout.channels
+        rgb = np.empty((len(uv), outputs), np.float32)
+        common = (raw, self._threads, self._variant)
+        self._model.evaluate(weights, texels, uv, light, view, footprint, rgb, False, *common)
+        return rgb
+
+    def evaluate_lights(
+        self,
+        weights: Array,
+        texels: Array,
+        uv: Array,
+        lights: Array,
+        view: Array,
+        footprint: Array | None = None,
+    ) -> Array:
+        """(m, b, c) reflectance of b views under m lights (m, 3) that all of them share.
+
+        What does not depend on the light is computed once a view.
+        """
+        rgb = np.empty((len(lights), len(uv), self._layout.channels), np.float32)
+        common = (False, self._threads, self._variant)
+        self._model.evaluate(weights, texels, uv, lights, view, footprint, rgb, True, *common)
+        return rgb
+
+    def depths(self, weights: Array, texels: Array, uv: Array, view: Array) -> Array:
+        """As `depths_plain`."""
+        out = np.empty(len(uv), np.float32)
+        self._model.depths(weights, texels, uv, view, out, self._threads, self._variant)
+        return out
+
+    def train(
+        self,
+        weights: Array,
+        texels: Array,
+        uv: Array,
+        light: Array,
+        view: Array,
+        footprint: Array | None,
+        target: Array,
+        weight: Array | None = None,
+        *,
+        loss: Loss = "square",
+    ) -> tuple[float, int]:
+        """Loss of one batch against log(1 + max(target, -0.1)); its gradients are added up here.
+
+        Args:
+            target: (b, c) reflectance; values that are not finite count nothing.
+            weight: (b,) of each query, None for 1.
+
+        Returns:
+            The loss, a mean over b x c, and how many values counted.
+        """
+        kind = 0 if loss == "square" else 1
+        common = (kind, self._threads, self._variant)
+        return self._model.train(
+            weights, texels, uv, light, view, footprint, target, weight, *common
+        )
+
+    def gradients(self) -> tuple[Array, Array]:
+        """Gradients added up so far: (weights,) and (texels, 8)."""
+        weights = np.empty(self._layout.weights, np.float32)
+        texels = np.empty((self._layout.texels, CHANNELS), np.float32)
+        self._model.gradients(weights, texels)
+        return weights, texels
+
+    def adam(
+        self,
+        weights: tuple[Array, Array, Array],
+        texels: tuple[Array, Array, Array],
+        *,
+        lr: tuple[float, float],
+        step: int,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+        dense: bool = True,
+    ) -> None:
+        """One step of Adam in place, with the gradients added up here, which are zeroed.
+
+        Args:
+            weights, texels: parameters, first and second moments.
+            lr: of the weights and of the texels.
+            step: counted from 1.
+            dense: False moves only texels that the batch touched; the others keep their
+                moments as they are.
+        """
+        rest = (*lr, *betas, eps, step, dense, self._threads, self._variant)
+        self._model.adam(*weights, *texels, *rest)
+
+
+def available() -> bool:
+    """Whether the compiled kernel is there."""
+    return native.load("neural") is not None
+
+
+def variants() -> list[str]:
+    """Vector variants that this processor runs, best first; none without the extension."""
+    module = native.load("neural")
+    return [] if module is None else module.variants()
+
+
+def peak(seconds: float = 0.2, variant: str = "") -> float:
+    """Measured float32 operations a CPU second of one thread: multiply-adds from registers."""
+    module = native.load("neural")
+    if module is None:
+        raise RuntimeError("the NeuMIP kernel was not built")
+    return module.peak(seconds, variant)
+
+
+def _network(network: Network) -> tuple[list[int], list[int], int]:
+    directions = [DIRECTIONS.index(name) for name in network.directions]
+    return list(network.widths), directions, ACTIVATIONS.index(network.activation)

@@ -1,0 +1,382 @@
+// NeuMIP: evaluation, gradients and optimisation in fused kernels. Face and numpy twin: __init__.py, plain.py.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <ctime>
+#include <memory>
+#include <string>
+#include <vector>
+
+#if defined(__x86_64__)
+#include <immintrin.h>
+#endif
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
+#include "../arrays.hpp"
+#include "../spread.hpp"
+#include "blur.hpp"
+#include "plan.hpp"
+
+#define NEUMIP_KEEP(x) asm volatile("" : "+r,m"(x) : : )
+#if defined(__x86_64__) && defined(__GNUC__)
+#undef NEUMIP_KEEP
+#define NEUMIP_KEEP(x) asm volatile("" : "+x"(x))
+#define NEUMIP_SPACE avx2
+#define NEUMIP_LANES 8
+#define NEUMIP_TARGET __attribute__((target("avx2,fma")))
+#include "variant.hpp"
+#undef NEUMIP_SPACE
+#undef NEUMIP_LANES
+#undef NEUMIP_TARGET
+#define NEUMIP_SPACE avx512
+#define NEUMIP_LANES 16
+#define NEUMIP_TARGET \
+    __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx2,fma,prefer-vector-width=512")))
+#include "variant.hpp"
+#undef NEUMIP_SPACE
+#undef NEUMIP_LANES
+#undef NEUMIP_TARGET
+#elif defined(__aarch64__)
+#undef NEUMIP_KEEP
+#define NEUMIP_KEEP(x) asm volatile("" : "+w"(x))
+#endif
+
+#define NEUMIP_SPACE baseline
+#define NEUMIP_LANES 4
+#define NEUMIP_TARGET
+#include "variant.hpp"
+
+namespace nb = nanobind;
+using namespace neumip;
+
+namespace {
+
+struct Variant {
+    const char* name;
+    decltype(&baseline::evaluate) evaluate;
+    decltype(&baseline::depths) depths;
+    decltype(&baseline::train) train;
+    decltype(&baseline::adam) adam;
+    decltype(&baseline::peak) peak;
+};
+
+#define NEUMIP_VARIANT(space) \
+    Variant { #space, space::evaluate, space::depths, space::train, space::adam, space::peak }
+
+std::vector<Variant> supported() {
+    std::vector<Variant> found;
+#if defined(__x86_64__) && defined(__GNUC__)
+    __builtin_cpu_init();
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") &&
+        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw"))
+        found.push_back(NEUMIP_VARIANT(avx512));
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
+        found.push_back(NEUMIP_VARIANT(avx2));
+#endif
+    found.push_back(NEUMIP_VARIANT(baseline));
+    return found;
+}
+
+bool multiplies_pairs() {
+#if defined(__x86_64__) && (defined(__clang__) || __GNUC__ >= 10)
+    __builtin_cpu_init();
+    return __builtin_cpu_supports("avx512bf16");
+#else
+    return false;
+#endif
+}
+
+Variant variant(const std::string& name) {
+    const auto known = supported();
+    if (name.empty()) return known.front();
+    for (const auto& v : known)
+        if (name == v.name) return v;
+    throw std::invalid_argument("this processor has no variant '" + name + "'");
+}
+
+// Zeros that begin on a huge page: a texel never lies across two cache lines, and random texels
+// of a large texture do not each need a page walk.
+class Zeros {
+  public:
+    explicit Zeros(size_t count) {
+        constexpr size_t page = size_t(1) << 21;
+        const size_t bytes = count * sizeof(float), align = bytes < page ? 64 : page;
+        const size_t whole = (bytes + align - 1) / align * align + (bytes == 0) * align;
+        data_.reset(static_cast<float*>(std::aligned_alloc(align, whole)));
+        if (!data_) throw std::bad_alloc();
+#if defined(__linux__)
+        if (align == page) madvise(data_.get(), whole, MADV_HUGEPAGE);
+#endif
+        std::memset(data_.get(), 0, bytes);
+    }
+    float* data() { return data_.get(); }
+    float operator[](size_t i) const { return data_.get()[i]; }
+
+  private:
+    struct Free {
+        void operator()(float* p) const { std::free(p); }
+    };
+    std::unique_ptr<float, Free> data_;
+};
+
+// A model's layout, and the scratch that its training keeps between steps.
+class Model {
+  public:
+    Model(bool wrap, float aspect, float depth_scale, int output, int channels, int frames,
+          const std::vector<std::vector<int64_t>>& textures,
+          const std::vector<std::vector<double>>& banks, bool offset,
+          const std::vector<int>& heights,
+          const std::vector<int>& offset_widths, const std::vector<int>& offset_directions,
+          int offset_activation, const std::vector<int>& widths,
+          const std::vector<int>& directions, int activation, bool half) {
+        Plan& p = plan_;
+        p.wrap = wrap;
+        p.aspect = aspect;
+        p.depth_scale = depth_scale;
+        p.output = output;
+        p.channels = channels;
+        p.frames = frames;
+        p.half = half;
+        p.pairs = multiplies_pairs();
+        for (const auto& t : textures) {
+            require(t.size() == 3, "a texture is (h, w, start)");
+            p.textures.push_back({int(t[0]), int(t[1]), t[2]});
+        }
+        for (size_t i = 0; i < banks.size(); ++i) {
+            const auto& b = banks[i];
+            require(b.size() == 6, "a bank is (channels, first, count, view, light, shift)");
+            const Bank bank{int(b[0]), int(b[1]), int(b[2]), float(b[3]), float(b[4]), float(b[5])};
+            if (offset && i == 0) p.offset_bank = bank;
+            else p.banks.push_back(bank);
+        }
+        p.offset = offset;
+        if (!heights.empty()) {
+            require(heights.size() == 2 && heights[0] > 0 && heights[1] > 0, "heights are (h, w)");
+            p.heights = {heights[0], heights[1], 0};
+        }
+        if (offset) {
+            p.offset_mlp.widths = offset_widths;
+            p.offset_mlp.directions = offset_directions;
+            p.offset_mlp.activation = offset_activation;
+        }
+        p.decoder.widths = widths;
+        p.decoder.directions = directions;
+        p.decoder.activation = activation;
+        check(p);
+        p.decoder.start = offset ? p.offset_mlp.size() : 0;
+    }
+
+    Model(const Model&) = delete;
+    Model& operator=(const Model&) = delete;
+
+    // Promises that the texels stay as they are: their range is not looked up again.
+    void freeze(In<float> t) {
+        require(int64_t(t.size()) == texels() * kChannels, "size of the texels");
+        frozen_ = false;
+        Batch b;
+        range(t.data(), b);
+        top_ = b.top;
+        bottom_ = b.bottom;
+        frozen_ = true;
+    }
+
+    int64_t weights() const { return int64_t(plan_.weights()); }
+    int64_t texels() const { return plan_.texels(); }
+
+    void evaluate(In<float> w, In<float> t, In<float> uv, In<float> light, In<float> view,
+                  nb::object footprint, Out<float> rgb, bool shared, bool raw, int threads,
+                  const std::string& name) const {
+        Batch b = batch(w, t, uv, view, footprint);
+        const int64_t outputs = raw ? plan_.decoder.widths.back() : plan_.channels;
+        const int64_t lights = int64_t(light.size()) / 3;
+        require(shared || lights == b.size, "one light a query");
+        require(int64_t(rgb.size()) == (shared ? lights : 1) * b.size * outputs, "size of rgb");
+        b.light = light.data();
+        const auto v = variant(name);
+        float* out = rgb.data();
+        const float* all = shared ? light.data() : nullptr;
+        nb::gil_scoped_release release;
+        spread(b.size, kGrain, useful(b.size, threads), [&](int, int64_t from, int64_t to) {
+            v.evaluate(plan_, w.data(), t.data(), b, all, lights, from, to, out, raw);
+        });
+    }
+
+    void depths(In<float> w, In<float> t, In<float> uv, In<float> view, Out<float> out,
+                int threads, const std::string& name) const {
+        const Batch b = batch(w, t, uv, view, nb::none());
+        require(int64_t(out.size()) == b.size, "size of the depths");
+        const auto v = variant(name);
+        nb::gil_scoped_release release;
+        spread(b.size, kGrain, useful(b.size, threads), [&](int, int64_t from, int64_t to) {
+            v.depths(plan_, w.data(), t.data(), b, from, to, out.data());
+        });
+    }
+
+    // Adds the gradients of one batch to those kept here; returns (loss, values counted).
+    nb::tuple train(In<float> w, In<float> t, In<float> uv, In<float> light, In<float> view,
+                    nb::object footprint, In<float> target, nb::object weight, int loss,
+                    int threads, const std::string& name) {
+        Batch b = batch(w, t, uv, view, footprint);
+        require(int64_t(light.size()) == 3 * b.size, "one light a query");
+        require(int64_t(target.size()) == plan_.channels * b.size, "size of the targets");
+        b.light = light.data();
+        b.target = target.data();
+        if (!weight.is_none()) b.weight = floats(weight, b.size, "one weight a query");
+        const auto v = variant(name);
+        threads = useful(b.size, threads);
+        grow(threads);
+        std::vector<Gradient> part(threads);
+        {
+            nb::gil_scoped_release release;
+            spread(b.size, kGrain, threads, [&](int i, int64_t from, int64_t to) {
+                part[i].weights = weights_[i].data();
+                part[i].texels = texels_[i].data();
+                part[i].touched = touched_[i].data();
+                v.train(plan_, w.data(), t.data(), b, loss, from, to, part[i]);
+            });
+        }
+        double sum = 0;
+        int64_t counted = 0;
+        for (const auto& p : part) {
+            sum += p.loss;
+            counted += p.counted;
+        }
+        return nb::make_tuple(sum, counted);
+    }
+
+    // The gradients kept here, summed over threads; they stay.
+    void gradients(Out<float> w, Out<float> t) const {
+        require(int64_t(w.size()) == weights() && int64_t(t.size()) == texels() * kChannels,
+                "sizes of the gradients");
+        std::fill(w.data(), w.data() + w.size(), 0.f);
+        std::fill(t.data(), t.data() + t.size(), 0.f);
+        for (size_t i = 0; i < weights_.size(); ++i) {
+            for (size_t k = 0; k < w.size(); ++k) w.data()[k] += weights_[i][k];
+            for (size_t k = 0; k < t.size(); ++k) t.data()[k] += texels_[i][k];
+        }
+    }
+
+    // One step of Adam with the gradients kept here, which are zeroed.
+    void adam(Out<float> w, Out<float> wm, Out<float> wv, Out<float> t, Out<float> tm,
+              Out<float> tv, float lr_weights, float lr_texels, float b1, float b2, float eps,
+              int64_t step, bool dense, int threads, const std::string& name) {
+        for (const auto& a : {w, wm, wv}) require(int64_t(a.size()) == weights(), "weights");
+        for (const auto& a : {t, tm, tv}) require(int64_t(a.size()) == texels() * kChannels, "texels");
+        const auto v = variant(name);
+        grow(1);
+        std::vector<float*> gw, gt;
+        std::vector<uint8_t*> marks;
+        for (size_t i = 0; i < weights_.size(); ++i) {
+            gw.push_back(weights_[i].data());
+            gt.push_back(texels_[i].data());
+            marks.push_back(touched_[i].data());
+        }
+        const float s1 = float(1 / (1 - std::pow(double(b1), double(step))));
+        const float s2 = float(1 / (1 - std::pow(double(b2), double(step))));
+        const int buffers = int(weights_.size());
+        nb::gil_scoped_release release;
+        v.adam(w.data(), wm.data(), wv.data(), gw.data(), nullptr, buffers, 0, weights(),
+               lr_weights, b1, b2, eps, s1, s2, true);
+        const int64_t size = texels() * kChannels;
+        spread(size, 16 * kChannels, useful(size / 64, threads), [&](int, int64_t from, int64_t to) {
+            v.adam(t.data(), tm.data(), tv.data(), gt.data(), marks.data(), buffers, from, to,
+                   lr_texels, b1, b2, eps, s1, s2, dense);
+        });
+    }
+
+  private:
+    static constexpr int64_t kGrain = 256;
+    static int useful(int64_t size, int threads) {
+        // A thread below four tiles costs more to start than it saves.
+        return int(std::clamp<int64_t>(size / (4 * kGrain), 1, std::max(threads, 1)));
+    }
+    static const float* floats(const nb::object& o, int64_t size, const char* what) {
+        const auto array = nb::cast<In<float>>(o);
+        require(int64_t(array.size()) == size, what);
+        return array.data();
+    }
+    Batch batch(const In<float>& w, const In<float>& t, const In<float>& uv,
+                const In<float>& view, const nb::object& footprint) const {
+        require(int64_t(w.size()) == weights(), "size of the weights");
+        require(int64_t(t.size()) == texels() * kChannels, "size of the texels");
+        Batch b;
+        b.size = int64_t(uv.size()) / 2;
+        require(int64_t(view.size()) == 3 * b.size, "one view a query");
+        b.uv = uv.data();
+        b.view = view.data();
+        range(t.data(), b);
+        if (!footprint.is_none()) b.footprint = floats(footprint, b.size, "one footprint a query");
+        return b;
+    }
+    // Highest and lowest height: of texels that were frozen, those found then.
+    void range(const float* heights, Batch& b) const {
+        const int64_t count = int64_t(plan_.heights.h) * plan_.heights.w;
+        if (count == 0) return;
+        if (frozen_) {
+            b.top = top_;
+            b.bottom = bottom_;
+            return;
+        }
+        float top = -INFINITY, bottom = INFINITY;
+        for (int64_t i = 0; i < count; ++i) {
+            top = heights[i] > top ? heights[i] : top;
+            bottom = heights[i] < bottom ? heights[i] : bottom;
+        }
+        b.top = top >= bottom ? top : 0.f;
+        b.bottom = top >= bottom ? bottom : 0.f;
+    }
+    void grow(int threads) {
+        while (int(weights_.size()) < threads) {
+            weights_.emplace_back(plan_.weights(), 0.f);
+            texels_.emplace_back(size_t(texels()) * kChannels);
+            touched_.emplace_back(size_t(texels() + 1) / 2, 0);
+        }
+    }
+
+    Plan plan_;
+    bool frozen_ = false;
+    float top_ = 0, bottom_ = 0;
+    std::vector<std::vector<float>> weights_;
+    std::vector<Zeros> texels_;
+    std::vector<std::vector<uint8_t>> touched_;
+};
+
+}  // namespace
+
+NB_MODULE(_neural, m) {
+    nb::class_<Model>(m, "Model")
+        .def(nb::init<bool, float, float, int, int, int, const std::vector<std::vector<int64_t>>&,
+                      const std::vector<std::vector<double>>&, bool, const std::vector<int>&,
+                      const std::vector<int>&, const std::vector<int>&, int, const std::vector<int>&,
+                      const std::vector<int>&, int, bool>())
+        .def_prop_ro("weights", &Model::weights)
+        .def_prop_ro("texels", &Model::texels)
+        .def("evaluate", &Model::evaluate, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
+             nb::arg().none(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg())
+        .def("freeze", &Model::freeze)
+        .def("depths", &Model::depths)
+        .def("train", &Model::train, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
+             nb::arg().none(), nb::arg(), nb::arg().none(), nb::arg(), nb::arg(), nb::arg())
+        .def("gradients", &Model::gradients)
+        .def("adam", &Model::adam);
+    m.def("blur", &neumip::blur);
+    m.def("variants", [] {
+        std::vector<std::string> names;
+        for (const auto& v : supported()) names.emplace_back(v.name);
+        return names;
+    });
+    m.def("peak", [](double seconds, const std::string& name) {
+        const auto v = variant(name);
+        nb::gil_scoped_release release;
+        return v.peak(seconds);
+    });
+}

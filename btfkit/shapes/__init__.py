@@ -1,0 +1,1 @@
+"""What a material is looked at on: closed shapes, meshes, and the eye."""
