@@ -53,7 +53,7 @@ def test_memory_does_not_grow_with_the_source(tmp_path: Path) -> None:
     script = """
         import resource, sys
         from pathlib import Path
-        from btfkit.io.ingest import Part, ingest
+        from btfkit.ingest import Part, ingest
         def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
         source, out = Path(sys.argv[1]), Path(sys.argv[2])
         ingest(source, out / "few.btf.zarr", part=Part(views=slice(0, 1)), jobs=2)
@@ -90,8 +90,9 @@ CRASHES = """
     import json, os, shutil, signal, sys
     from pathlib import Path
     import numpy, zarr, btfkit
-    from btfkit.io import images, writer
-    from btfkit.io.ingest import ingest
+    from btfkit.io import images
+    from btfkit.io.store import writer
+    from btfkit.ingest import ingest
     writer._SHARD_BYTES = 3 * 16 * 16 * 3 * 2
     source, folder, jobs, force = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), sys.argv[4] == "force"
     out = folder / "a.btf.zarr"

@@ -195,7 +195,7 @@ def test_interruption_exits_130_and_keeps_what_was_finished(tmp_path: Path) -> N
         from btfkit import io
         from btfkit.btf import BTF
         from btfkit.cli import main
-        from btfkit.io import writer
+        from btfkit.io.store import writer
         from btfkit.textures import Textures
         writer._SHARD_BYTES = 1
         class Slow(Textures):

@@ -145,7 +145,7 @@ def test_nothing_measured_is_told() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(native.load("neumip") is None, reason="the kernel was not built")
+@pytest.mark.skipif(native.load("neural") is None, reason="the kernel was not built")
 def test_training_from_a_pool_is_measured_beside_training_from_memory() -> None:
     """The benchmark runs: a pool of 42 of 144 textures costs little and hardly ever waits."""
     script = Path(__file__).parents[2] / "benchmarks" / "pool.py"

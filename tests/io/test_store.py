@@ -159,7 +159,7 @@ def test_a_killed_write_leaves_no_store_and_is_resumed(tmp_path: Path) -> None:
         """
         import sys, time, numpy as np
         from btfkit.btf import BTF
-        from btfkit.io import writer
+        from btfkit.io.store import writer
         from btfkit.textures import Textures
         writer._SHARD_BYTES = 1
         class Slow(Textures):
