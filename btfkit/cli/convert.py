@@ -52,8 +52,8 @@ def written(
     btf: BTF, out: Path, kind: str, settings: Mapping[str, str], *, force: bool, progress: Bar
 ) -> None:
     """Write a BTF by the writer of a format, with its own options given as text."""
-    from btfkit.cli.settings import matched
+    from btfkit.settings import options_of
 
     module = importlib.import_module(WRITERS[kind])
-    options = matched(module.write, settings)
+    options = options_of(module.write, settings)
     module.write(btf, out, force=force, progress=progress, **options)

@@ -9,6 +9,7 @@ from typing import Any, final
 
 import click
 
+from btfkit import settings
 from btfkit.errors import BtfkitError
 
 
@@ -105,10 +106,10 @@ class SettingType(click.ParamType[tuple[str, str]]):
     ) -> tuple[str, str]:
         if isinstance(value, tuple):
             return value
-        key, equals, setting = str(value).partition("=")
-        if not equals or not key:
-            self.fail(f"{value!r}; expected key=value", param, ctx)
-        return key, setting
+        try:
+            return settings.split(str(value))
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
 
 
 def out_option(what: str) -> Callable[..., Any]:

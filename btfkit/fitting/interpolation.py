@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from btfkit.btf import BTF
 from btfkit.errors import FitError
-from btfkit.fitting.settings import parsed
+from btfkit.settings import parsed
 from btfkit.materials.measured.blend import pair_arrays
 from btfkit.materials.measured.interpolation import Interpolation, header_of, spec_of
 from btfkit.queries import QuerySet

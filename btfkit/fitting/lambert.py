@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.interpolation import images_of
-from btfkit.fitting.settings import parsed
+from btfkit.settings import parsed
 from btfkit.materials.base import Header
 from btfkit.materials.measured.interpolation import header_of
 from btfkit.materials.lambert import Lambert, LambertSpec

@@ -14,7 +14,7 @@ from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.factorisation import Factors, Rows, factorised
 from btfkit.fitting.interpolation import HALF_RANGE, images_of
-from btfkit.fitting.settings import parsed
+from btfkit.settings import parsed
 from btfkit.materials.measured.blend import pair_arrays
 from btfkit.materials.measured.interpolation import header_of
 from btfkit.materials.measured.pca import PCA, Domain, PCASpec

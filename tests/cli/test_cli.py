@@ -18,7 +18,6 @@ from btfkit.btf import BTF
 from btfkit.cli import VERBS, btfkit
 from btfkit.cli.options import DurationType, SettingType, SliceType, WindowType
 from btfkit.cli.outcome import plain, run
-from btfkit.cli.settings import matched
 from btfkit.io.store import writer
 
 ENTRY = str(Path(sys.executable).with_name("btfkit"))
@@ -265,15 +264,6 @@ def test_option_values_that_are_none_are_refused(
 ) -> None:
     with pytest.raises(click.BadParameter, match=message):
         kind.convert(text, None, None)
-
-
-def test_settings_become_the_options_of_a_writer() -> None:
-    def write(path: str, *, rank: int = 0, log: bool = True, force: bool = False) -> None:
-        raise NotImplementedError
-
-    assert matched(write, {"rank": "64", "log": "false"}) == {"rank": 64, "log": False}
-    with pytest.raises(ValueError, match="no setting force; there are rank, log"):
-        matched(write, {"force": "true"})
 
 
 def test_an_interruption_that_a_library_wrapped_is_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,6 @@ from btfkit.fitting.fit import fit, split
 from btfkit.fitting.lambert import lambert
 from btfkit.fitting.rainer import trainable as rainer
 from btfkit.fitting.rainer.networks import Decoder, SetEncoder
-from btfkit.fitting.settings import parsed
 from btfkit.io.store.writer import write
 from btfkit.materials.bilinear import corners, lookup
 from btfkit.materials.evaluation import answer_pair, errors_on_btf
@@ -674,14 +673,7 @@ def test_autoencoders_beat_lambert(model: str) -> None:
     assert ours < 0.7 * fit(in_memory(), model="lambert").errors["mse"]
 
 
-# --- settings -----------------------------------------------------------------------------------
-
-
-def test_settings_take_the_types_of_their_defaults() -> None:
-    found = parsed(pca.Settings, "pca", {"rank": "3", "floor": "0.5", "layout": "channels"})
-    assert (found.rank, found.floor, found.layout) == (3, 0.5, "channels")
-    with pytest.raises(ValueError, match="pca has no setting depth; it has rank, bytes"):
-        parsed(pca.Settings, "pca", {"depth": "3"})
+# --- reports ------------------------------------------------------------------------------------
 
 
 def test_reports_of_closed_forms_are_whole(tmp_path: Path) -> None:

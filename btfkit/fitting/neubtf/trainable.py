@@ -28,7 +28,7 @@ from btfkit.fitting.loop import Generators, Trainable, restore_tensors, tensors_
 from btfkit.fitting.neubtf.data import Directions, HeldOut, first_latents, frontal_slice
 from btfkit.fitting.neubtf.settings import Settings
 from btfkit.fitting.pool import Pool
-from btfkit.fitting.settings import parsed
+from btfkit.settings import parsed
 from btfkit.fitting.neubtf.siren import ParallaxHead, Renderer, on_disc
 from btfkit.fitting.neubtf.unet import Encoder
 from btfkit.materials import neubtf as evaluated

@@ -18,7 +18,7 @@ from btfkit.fitting.neumip.engines import eager
 from btfkit.fitting.loop import Generators, Trainable
 from btfkit.fitting.neumip.data import Batch, RowSource, Source, TexelSource
 from btfkit.fitting.neumip.settings import Settings
-from btfkit.fitting.settings import parsed
+from btfkit.settings import parsed
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip import arrays as neumip_arrays
 from btfkit.materials.base import Header, Material

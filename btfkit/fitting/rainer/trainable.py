@@ -26,7 +26,7 @@ from btfkit.fitting.rainer.networks import Decoder, SetEncoder, TableEncoder
 from btfkit.fitting.interpolation import images_of
 from btfkit.fitting.loop import Generators, Trainable, restore_tensors, tensors_of
 from btfkit.fitting.rainer.samples import Samples
-from btfkit.fitting.settings import parsed
+from btfkit.settings import parsed
 from btfkit.materials import file
 from btfkit.materials import rainer as evaluated
 from btfkit.materials.measured.interpolation import header_of
