@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from btfkit import directions
+from btfkit import directions, nearfield
 from btfkit.textures import Index, Textures, as_textures
 
 if TYPE_CHECKING:
@@ -184,7 +184,8 @@ class BTF:
         if (r.start, r.stop, c.start, c.stop) == (0, h, 0, w):
             return self
         # Positions are from the centre of the sample; the window has a centre of its own.
-        shift = np.array([(c.start + c.stop - w) / 2, -(r.start + r.stop - h) / 2, 0], np.float32)
+        middle = (r.start + r.stop - 1) / 2, (c.start + c.stop - 1) / 2
+        shift = np.array([*nearfield.texel_places(*middle, (h, w), 1.0), 0], np.float32)
         moved: dict[str, Any] = {
             name: None if at is None else at - shift * np.float32(self._known_texel_mm())
             for name, at in (
@@ -229,8 +230,6 @@ class BTF:
         _, h, w, _ = self.shape
         if near is None:
             return np.broadcast_to(far[index], (h, w, 3))
-        texel = self._known_texel_mm()
-        x = (np.arange(w) + 0.5 - w / 2) * texel
-        y = -(np.arange(h) + 0.5 - h / 2) * texel
-        plane = np.stack([*np.meshgrid(x, y), np.zeros((h, w))], axis=-1)
-        return directions.normalize(near[index] - plane).astype(np.float32)
+        rows, cols = np.arange(h)[:, None], np.arange(w)
+        x, y = nearfield.texel_places(rows, cols, (h, w), self._known_texel_mm())
+        return nearfield.directions_at(near[index], x, y).astype(np.float32)

@@ -13,6 +13,7 @@ from btfkit import directions, metrics
 from btfkit.btf import BTF
 from btfkit.materials.evaluation import texel_centres
 from btfkit.materials.neubtf import NeuBTF
+from btfkit.nearfield import directions_at, texel_places
 from btfkit.synthesis.drift import Drift
 from btfkit.synthesis.indexmap import IndexMap
 from btfkit.synthesis.join import joined
@@ -171,13 +172,13 @@ def _far(btf: BTF, index: IndexMap) -> dict[str, Any]:
     """Directions instead of positions, seen from the middle of what the tile was cut from."""
     if btf.texel_mm is None:
         return {"light_position": None, "view_position": None}
-    (h, w), (row, col) = index.source, (float(index.rows.mean()), float(index.cols.mean()))
-    at = np.array([col + 0.5 - w / 2, h / 2 - row - 0.5, 0]) * btf.texel_mm
+    middle = float(index.rows.mean()), float(index.cols.mean())
+    x, y = texel_places(*middle, index.source, btf.texel_mm)
     found: dict[str, Any] = {}
     for name in ("light", "view"):
         position = getattr(btf, f"{name}_position")
         if position is not None:
-            found[name] = directions.normalize(position - at).astype(np.float32)
+            found[name] = directions_at(position, x, y).astype(np.float32)
             found[f"{name}_position"] = None
     return found
 

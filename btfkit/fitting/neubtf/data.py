@@ -13,6 +13,7 @@ from torch import Tensor
 
 from btfkit.btf import BTF
 from btfkit.errors import FitError
+from btfkit.nearfield import texel_places
 
 # Textures that the first latents are made of: their Gram matrix has three times as many rows.
 _COMPONENT_PAIRS = 160
@@ -90,8 +91,7 @@ class Directions:
     def at(self, index: NDArray[np.intp], rows: Tensor, cols: Tensor) -> tuple[Tensor, Tensor]:
         """(k, m or 1, 3) light and view of pairs (k,) at texels (m,)."""
         pairs = torch.from_numpy(index)
-        x = (cols + 0.5 - self._w / 2) * self._texel
-        y = -(rows + 0.5 - self._h / 2) * self._texel
+        x, y = texel_places(rows, cols, (self._h, self._w), self._texel)
         plane = torch.stack([x, y, torch.zeros_like(x)], dim=-1)
         found = [
             far[pairs][:, None] if near is None

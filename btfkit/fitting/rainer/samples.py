@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from btfkit.btf import BTF
-from btfkit.directions import normalize
 from btfkit.fitting.pool import Pool
 from btfkit.materials.evaluation import texel_centres
-from btfkit.materials.measured.near import on_sample
+from btfkit.nearfield import directions_at, uv_places
 
 # The darkest noise of a dark-subtracted measurement, as the losses count it.
 _DARKEST = -0.1
@@ -117,8 +116,7 @@ class Samples:
             if near is not None:
                 _, h, w, _ = btf.shape
                 uv = texel_centres(h, w).reshape(-1, 2)[texels.numpy()]
-                foot = np.zeros((len(uv), 3))
-                foot[:, :2] = on_sample(uv, (h, w), btf.texel_mm or 1.0)
-                unit = normalize(near[pairs][:, None] - foot[None])
+                x, y = uv_places(uv, (h, w), btf.texel_mm or 1.0).T
+                unit = directions_at(near[pairs][:, None], x, y)
             found.append(torch.from_numpy(np.asarray(unit[..., :2], np.float32).copy()))
         return found[0], found[1]

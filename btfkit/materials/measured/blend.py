@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from btfkit import directions
+from btfkit import directions, nearfield
 from btfkit.btf import BTF
 from btfkit.directions import Floats
 from btfkit.materials.measured.near import Near
@@ -126,8 +126,8 @@ class Blend:
         if self._lamps is None or at is None:
             return self.light[pair, 2]
         lamp = self._lamps.position[pair]
-        across = np.square(lamp[..., :2] - at[:, None]).sum(axis=-1)
-        return lamp[..., 2] / np.sqrt(across + np.square(lamp[..., 2]))
+        square = nearfield.squared_distances(lamp, at[:, None, 0], at[:, None, 1])
+        return nearfield.cosines(lamp, square)
 
     def _weights(self, light: Floats | Array, view: Floats | Array) -> tuple[Index, Array]:
         if self._tree is not None:

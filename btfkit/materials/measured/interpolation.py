@@ -13,7 +13,7 @@ from btfkit.btf import BTF
 from btfkit.materials.base import Array, Header, Material
 from btfkit.materials.bilinear import corners
 from btfkit.materials.measured.blend import Blend, pair_arrays
-from btfkit.materials.measured.near import on_sample
+from btfkit.nearfield import uv_places
 from btfkit.queries import Query
 
 # Below this cosine a light grazes, and a quotient by it is noise.
@@ -103,7 +103,7 @@ class Interpolation(Material):
     def _blended(self, query: Query) -> Array:
         at = None
         if self._blend.near:
-            at = on_sample(query.uv, self.spec.size, self.header.texel_mm or 1.0)
+            at = uv_places(query.uv, self.spec.size, self.header.texel_mm or 1.0)
         pair, weight = self._blend.weights(query.light, query.view, at)
         rows, cols, share = corners(query.uv, self.spec.size, self.header.wrap)
         falloff = np.maximum(query.light[:, 2:], GRAZING) / np.maximum(

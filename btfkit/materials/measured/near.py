@@ -17,14 +17,6 @@ Array = NDArray[np.float32]
 _STEPS = 6
 
 
-def on_sample(
-    uv: NDArray[np.floating], grid: tuple[int, int], texel_mm: float
-) -> NDArray[np.floating]:
-    """(b, 2) x and y in mm from the centre of the sample, of uv (b, 2)."""
-    h, w = grid
-    return (uv - 0.5) * np.array([w, -h]) * texel_mm
-
-
 @final
 @dataclass(frozen=True, eq=False)
 class Near:

@@ -18,7 +18,7 @@ from btfkit.materials.base import Array, Header, Material
 from btfkit.materials.bilinear import lookup
 from btfkit.materials.measured.blend import Blend
 from btfkit.materials.measured.interpolation import GRAZING
-from btfkit.materials.measured.near import on_sample
+from btfkit.nearfield import uv_places
 from btfkit.queries import Query
 
 Domain = Literal["log", "linear"]
@@ -94,7 +94,7 @@ class PCA(Material):
     def _blended(self, query: Query) -> Array:
         at = None
         if self._blend.near:
-            at = on_sample(query.uv, self.spec.size, self.header.texel_mm or 1.0)
+            at = uv_places(query.uv, self.spec.size, self.header.texel_mm or 1.0)
         pair, weight = self._blend.weights(query.light, query.view, at)
         if pair.strides[0] == 0:
             # One direction for all: its row of the table is blended once.

@@ -78,7 +78,7 @@ def draw(images: Images, seed: int, out: Draw) -> None:
 
 
 def draw_plain(images: Images, seed: int, out: Draw) -> None:
-    """The twin of `draw`: the same texels."""
+    """The twin of `draw`: the same texels, their rays as `btfkit.nearfield` gives them."""
     k, h, w, _ = images.values.shape
     count = np.uint64(len(out.uv))
     first = _scrambled(np.uint64(seed) + np.arange(count, dtype=np.uint64))
