@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 Index = NDArray[np.intp]
+# float16 ends at 65504; from here on rounding could reach infinity, and float32 is taken.
+HALF_RANGE = 6e4
 
 
 class Textures(ABC):

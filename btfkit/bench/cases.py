@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from btfkit.btf import BTF
 from btfkit.fitting.fit import split
-from btfkit.fitting.neumip.levels import blurred, gaussian
+from btfkit.footprint import blur_of, blurred, gaussian, most_levels, of_level
 from btfkit.materials.evaluation import texel_centres
 from btfkit.queries import QuerySet
-from btfkit.textures import as_textures
+from btfkit.textures import HALF_RANGE, as_textures
 
 # Held-out pictures; each also gives this many texels to every level of detail.
 _PICTURES = 12
@@ -162,7 +162,7 @@ def _in_memory(btf: BTF, dtype: type[np.floating]) -> BTF:
     images: NDArray[Any] = np.empty(btf.shape, dtype)
     for index in range(len(btf)):
         image = btf.texture(index)
-        if images.dtype == np.float16 and np.nanmax(np.abs(image), initial=0) > 6e4:
+        if images.dtype == np.float16 and np.nanmax(np.abs(image), initial=0) > HALF_RANGE:
             images = images.astype(np.float32)
         images[index] = image
     return replace(btf, textures=as_textures(images))
@@ -179,10 +179,10 @@ def _levels(btf: BTF) -> tuple[QuerySet, tuple[Coarse, ...]]:
     centres = texel_centres(h, w).reshape(h * w, 2)
     parts: list[Sequence[NDArray[Any]]] = []
     coarse = []
-    for level in range(max(h, w).bit_length()):
-        footprint = 0.5 * 2.0**level
+    for level in range(most_levels((h, w))):
+        footprint = float(of_level(level))
         down, across = (
-            gaussian(side, footprint**2 - 0.25, wrap=btf.wrap == "wrap") for side in (h, w)
+            gaussian(side, blur_of(footprint), wrap=btf.wrap == "wrap") for side in (h, w)
         )
         images = [blurred(btf.texture(pair), down, across) for pair in range(len(btf))]
         for pair, image in enumerate(images):

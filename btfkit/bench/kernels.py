@@ -18,9 +18,10 @@ from btfkit.btf import BTF
 from btfkit.fitting.neumip.settings import Settings
 from btfkit.fitting.neumip.start import initial_texels, initial_weights
 from btfkit.fitting.neumip.trainable import NeuMIP, spec_of
+from btfkit.footprint import most_levels
 from btfkit.materials.base import Header
 from btfkit.materials.neumip import material as evaluated
-from btfkit.materials.neumip.spec import NeuMIPSpec, most_levels
+from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.native.neural import Kernel, variants
 from btfkit.native.neural.layout import Activation, Array, Layout
 from btfkit.textures import as_textures

@@ -16,8 +16,7 @@ from btfkit.settings import parsed
 from btfkit.materials.measured.blend import pair_arrays
 from btfkit.materials.measured.interpolation import Interpolation, header_of, spec_of
 from btfkit.queries import QuerySet
-
-HALF_RANGE = 6e4
+from btfkit.textures import HALF_RANGE
 
 
 @final

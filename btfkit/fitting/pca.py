@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.factorisation import Factors, Rows, factorised
-from btfkit.fitting.interpolation import HALF_RANGE, images_of
+from btfkit.fitting.interpolation import images_of
 from btfkit.settings import parsed
+from btfkit.textures import HALF_RANGE
 from btfkit.materials.measured.blend import pair_arrays
 from btfkit.materials.measured.interpolation import header_of
 from btfkit.materials.measured.pca import PCA, Domain, PCASpec

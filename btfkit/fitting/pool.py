@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from btfkit import native
 from btfkit.btf import BTF
+from btfkit.textures import HALF_RANGE
 from btfkit.errors import FitError
 
 DEFAULT_BYTES = 1 << 30
@@ -139,7 +140,7 @@ class Pool:
             for batch in _ahead(workers, self._btf.batch, parts):
                 finite = np.isfinite(batch)
                 self.masked += int((~finite).any(axis=-1).sum())
-                if images.dtype == np.float16 and (np.abs(batch) > 6e4).any(where=finite):
+                if images.dtype == np.float16 and (np.abs(batch) > HALF_RANGE).any(where=finite):
                     images = images.astype(np.float32)
                 images[filled : filled + len(batch)] = np.where(finite, batch, np.nan)
                 filled += len(batch)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from btfkit import metrics
 from btfkit.btf import BTF
+from btfkit.footprint import level_of
 from btfkit.materials.base import Material
 from btfkit.queries import QuerySet
 
@@ -102,7 +103,7 @@ def errors_on_queries(material: Material, queries: QuerySet) -> dict[str, Any]:
         "masked": int((~valid).sum()),
     }
     if rows.footprint is not None and np.ptp(rows.footprint) > 0:
-        level = np.maximum(np.log2(2 * np.maximum(rows.footprint, 1e-30)), 0)
+        level = level_of(rows.footprint)
         nearest = np.round(level).astype(int)
         found["levels"] = [
             {"level": int(n), **_pooled(rgb[nearest == n], truth[nearest == n])}

@@ -15,13 +15,13 @@ from btfkit.errors import FitError
 from btfkit.fitting import loop
 from btfkit.fitting.fit import fit
 from btfkit.fitting.neumip import data, trainable
-from btfkit.fitting.neumip import levels as neumip_levels
 from btfkit.fitting.neumip import paper as neumip_paper
 from btfkit.materials import file
 from btfkit.materials.base import Header
 from btfkit.materials.neumip.arrays import aligned, name_arrays
 from btfkit.materials.neumip.material import NeuMIP, NeuMIPPaper, in_precision
-from btfkit.materials.neumip.spec import NeuMIPSpec, most_levels, sizes
+from btfkit.materials.neumip.spec import NeuMIPSpec
+from btfkit.footprint import blurred, gaussian
 from btfkit.native import neural as native
 from btfkit.queries import QuerySet
 from btfkit.relief.relief import Relief
@@ -244,12 +244,6 @@ def test_a_texture_smaller_than_the_grid_begins_at_its_own_level():
     assert spec.layout(Header(grid=(8, 8))).banks[0].shift == 0
 
 
-def test_pyramids_end_in_one_texel():
-    assert sizes((5, 12), most_levels((5, 12))) == ((5, 12), (2, 6), (1, 3), (1, 1))
-    assert most_levels((1, 1)) == 1
-    assert most_levels((512, 512)) == 10
-
-
 def test_group_25_quantised_textures_stay_close():
     first = material(NeuMIPSpec((32, 32), 4, activation="sine"), grid=(32, 32))
     rng = np.random.default_rng(5)
@@ -269,27 +263,6 @@ def test_group_25_quantised_textures_stay_close():
 # --- what it is trained on --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("wrap", [True, False])
-@pytest.mark.parametrize("side", [1, 2, 5, 64])
-def test_blurs_keep_constants_and_add_variance(side, wrap):
-    for variance in (0.0, 0.1, 3.0, 400.0):
-        matrix = neumip_levels.gaussian(side, variance, wrap=wrap)
-        np.testing.assert_allclose(matrix.sum(axis=1), 1, atol=1e-6)
-    if side == 64:
-        row = neumip_levels.gaussian(side, 9.0, wrap=wrap)[32]
-        # Four standard deviations hold all but 1e-4 of the variance.
-        assert row @ (np.arange(side) - 32.0) ** 2 == pytest.approx(9.0, rel=2e-3)
-
-
-def test_what_is_not_measured_does_not_bleed_into_blurred_textures():
-    image = np.ones((16, 16, 1), np.float32)
-    image[3:5, 3:5] = np.nan
-    matrix = neumip_levels.gaussian(16, 2.0, wrap=True)
-    blurred = neumip_levels.blurred(image, matrix, matrix)
-    np.testing.assert_allclose(blurred[np.isfinite(blurred)], 1, rtol=1e-5)
-    assert np.isnan(blurred).sum() < 16
-
-
 def test_coarse_batches_are_the_textures_blurred_by_the_contract():
     btf = bumps(n=6, h=16, w=24)
     source = data.TexelSource(btf, np.arange(6), np.arange(0), levels=4, seed=1,
@@ -305,8 +278,8 @@ def test_coarse_batches_are_the_textures_blurred_by_the_contract():
         col, line = np.rint(at).astype(int)
         np.testing.assert_allclose(at, [col, line], atol=1e-4)
         variance = sigma**2 - 0.25
-        down, across = (neumip_levels.gaussian(s, variance, wrap=True) for s in (16, 24))
-        truth = neumip_levels.blurred(btf.texture(pair), down, across)[line, col]
+        down, across = (gaussian(s, variance, wrap=True) for s in (16, 24))
+        truth = blurred(btf.texture(pair), down, across)[line, col]
         # The pool is float16.
         np.testing.assert_allclose(batch.target[row], truth, rtol=2e-3, atol=1e-3)
 

@@ -29,6 +29,7 @@ from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.fitting import fit
 from btfkit.fitting.neubtf import augment
+from btfkit.footprint import level_sizes
 from btfkit.io import anglenames, images, queryfile
 from btfkit.io.anglenames import Angles
 from btfkit.io.store import writer
@@ -37,7 +38,7 @@ from btfkit.materials.lambert import Lambert, LambertSpec
 from btfkit.materials.measured.interpolation import Interpolation
 from btfkit.materials.neubtf import NeuBTF, NeuBTFSpec
 from btfkit.materials.neumip.material import NeuMIP
-from btfkit.materials.neumip.spec import NeuMIPSpec, sizes
+from btfkit.materials.neumip.spec import NeuMIPSpec
 
 LIGHT, VIEW = np.array([0.3, -0.2, 0.9]), np.array([-0.1, 0.4, 0.8])
 
@@ -225,8 +226,8 @@ def test_group_12_materials_of_any_size_answer(name: str, size: tuple[int, int])
 
 def test_group_12_a_pyramid_of_400_ends_in_one_texel() -> None:
     expected = [400, 200, 100, 50, 25, 12, 6, 3, 1]
-    assert [h for h, _ in sizes((400, 400), 9)] == expected
-    assert sizes((400, 3), 4) == ((400, 3), (200, 1), (100, 1), (50, 1))
+    assert [h for h, _ in level_sizes((400, 400), 9)] == expected
+    assert level_sizes((400, 3), 4) == ((400, 3), (200, 1), (100, 1), (50, 1))
 
 
 def test_group_12_texels_beyond_32_bit_offsets_are_addressed(tmp_path: Path) -> None:

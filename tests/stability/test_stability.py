@@ -23,9 +23,9 @@ from btfkit.fitting.fit import fit
 from btfkit.fitting.neubtf.siren import Renderer
 from btfkit.fitting.neumip.data import TexelSource
 from btfkit.fitting.neumip.engines import eager
-from btfkit.fitting.neumip.levels import gaussian
 from btfkit.fitting.neumip.start import initial_texels
 from btfkit.fitting.neumip.trainable import NeuMIP as Fitted
+from btfkit.footprint import gaussian
 from btfkit.materials.base import Header
 from btfkit.materials.neubtf import NeuBTFSpec
 from btfkit.materials.neumip.material import NeuMIP, in_precision

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.footprint import blur_of, blurred_measured, gaussian, of_level
 from btfkit.native.neural.layout import Array
 
 Images = NDArray[np.float16] | NDArray[np.float32]
@@ -64,7 +63,7 @@ def _level(images: Images, level: int, seed: int) -> Level:
         [rng.integers(side - (kept - 1) * min(stride, side), size=count)
          for side, kept in ((h, rows), (w, cols))], axis=1,
     ).astype(np.int32)  # fmt: skip
-    blur = (0.5 * 2 ** (level - rng.integers(_BLURS, size=count) / _BLURS)).astype(np.float32)
+    blur = of_level(level - rng.integers(_BLURS, size=count) / _BLURS).astype(np.float32)
     return Level(slots, stride, phase, blur, np.empty((count, rows, cols, c), images.dtype))
 
 
@@ -77,7 +76,7 @@ def _fill(images: Images, levels: list[Level], *, wrap: bool) -> None:
             users.setdefault(int(slot), []).append((level, at))
         for blur in set(level.blur.tolist()):
             for side in images.shape[1:3]:
-                matrices[side, blur] = gaussian(side, blur**2 - 0.25, wrap=wrap)
+                matrices[side, blur] = gaussian(side, blur_of(blur), wrap=wrap)
     for slot, wanted in users.items():
         image = images[slot].astype(np.float32)
         finite = np.isfinite(image)
@@ -89,48 +88,4 @@ def _fill(images: Images, levels: list[Level], *, wrap: bool) -> None:
                     images.shape[1:3], level.phase[at], level.values.shape[1:3], strict=True
                 )
             )
-            level.values[at] = _blurred(image, down, across, holes)
-
-
-@lru_cache(maxsize=8)
-def gaussian(side: int, variance: float, *, wrap: bool) -> Array:
-    """(side, side) matrix that blurs a column of texels; rows sum to 1, borders wrap or clamp.
-
-    Args:
-        side: texels. variance: of the Gaussian, texels squared.
-    """
-    if variance <= 0:
-        return np.eye(side, dtype=np.float32)
-    reach = math.ceil(4 * math.sqrt(variance))
-    steps = np.arange(-reach, reach + 1)
-    weight = np.exp(-(steps**2) / (2 * variance))
-    weight /= weight.sum()
-    matrix = np.zeros((side, side))
-    at = np.arange(side)[:, None] + steps
-    at = at % side if wrap else np.clip(at, 0, side - 1)
-    np.add.at(matrix, (np.arange(side)[:, None], at), weight)
-    return matrix.astype(np.float32)
-
-
-def blurred(image: Array, down: Array, across: Array) -> Array:
-    """down @ image @ across^T of an image (h, w, c); NaN where less than half is measured."""
-    finite = np.isfinite(image)
-    return _blurred(image, down, across, None if finite.all() else finite)
-
-
-def _blurred(
-    image: Array, down: Array, across: Array, measured: NDArray[np.bool_] | None
-) -> Array:
-    """As `blurred`, where it is known what is measured; None: everything."""
-    if measured is None:
-        return _separable(image, down, across)
-    known = _separable(measured.astype(np.float32), down, across)
-    total = _separable(np.where(measured, image, np.float32(0)), down, across)
-    return np.where(known >= 0.5, total / np.maximum(known, 1e-6), np.float32(np.nan))
-
-
-def _separable(image: Array, down: Array, across: Array) -> Array:
-    h, w, c = image.shape
-    part = (down @ image.reshape(h, -1)).reshape(-1, w, c)
-    found: Array = np.matmul(across, part)
-    return found
+            level.values[at] = blurred_measured(image, down, across, holes)

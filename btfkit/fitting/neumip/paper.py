@@ -17,7 +17,7 @@ from btfkit.errors import FitError
 from btfkit.fitting.neumip.engines import eager
 from btfkit.fitting.adam import adam_plain
 from btfkit.fitting.neumip.data import Batch
-from btfkit.fitting.neumip.levels import gaussian
+from btfkit.footprint import gaussian
 from btfkit.fitting.neumip.recipe import Recipe, tensors, torch_loss
 from btfkit.fitting.neumip.start import initial_texels
 from btfkit.materials.neumip import material as evaluated

@@ -23,7 +23,8 @@ from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip import arrays as neumip_arrays
 from btfkit.materials.base import Header, Material
 from btfkit.materials.measured.interpolation import header_of
-from btfkit.materials.neumip.spec import NeuMIPSpec, most_levels
+from btfkit.materials.neumip.spec import NeuMIPSpec
+from btfkit.footprint import most_levels
 from btfkit.native.neural.layout import Array, Layout
 from btfkit.queries import QuerySet
 

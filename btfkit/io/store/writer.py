@@ -29,12 +29,10 @@ from btfkit.btf import BTF, QUANTITY
 from btfkit.errors import BtfkitError
 from btfkit.files import refuse_existing, replace_folder
 from btfkit.io.store.reader import IMAGE_AXES, VERSION, shard_path
-from btfkit.textures import Textures, as_textures
+from btfkit.textures import HALF_RANGE, Textures, as_textures
 
 # Bytes of textures in one shard: what a worker holds, and what an interruption can lose.
 _SHARD_BYTES = 32 << 20
-# float16 ends at 65504; from 6e4 on rounding could reach infinity.
-_HALF_LIMIT = 6e4
 _JOURNAL = "journal.jsonl"
 
 
@@ -193,7 +191,7 @@ class _Job:
                 if name == "texture":
                     masked += int((~finite).any(axis=-1).sum())
                 largest = np.abs(image).max(initial=0.0, where=finite)
-                if array.dtype == np.float16 and largest > _HALF_LIMIT:
+                if array.dtype == np.float16 and largest > HALF_RANGE:
                     raise HalfRangeError(
                         f"pair {pair} holds {largest:.6g}; float16 ends at 6e4",
                         remedy="write float32",

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal, final
 
+from btfkit.footprint import level_sizes, resolved_level
 from btfkit.materials.base import Header
 from btfkit.native.neural.layout import Activation, Layout, Network, Networks, Output, Pyramid
 
@@ -64,13 +64,13 @@ class NeuMIPSpec:
 
     def layout(self, header: Header) -> Layout:
         """The model as its kernels see it."""
-        shift = _level_of(self.size, header.grid)
-        banks = [Pyramid(sizes(self.size, self.levels), self.features, shift=shift)]
+        shift = resolved_level(self.size, header.grid)
+        banks = [Pyramid(level_sizes(self.size, self.levels), self.features, shift=shift)]
         if self.coarse:
-            base = sizes(self.size, _COARSE + 1)[-1]
+            base = level_sizes(self.size, _COARSE + 1)[-1]
             levels = max(self.levels - _COARSE, 1)
-            start = _level_of(base, header.grid)
-            banks.append(Pyramid(sizes(base, levels), self.coarse, shift=start))
+            start = resolved_level(base, header.grid)
+            banks.append(Pyramid(level_sizes(base, levels), self.coarse, shift=start))
         if self.light:
             banks.append(Pyramid((self.size,), self.light, light=1.0, shift=shift))
         outputs = self.channels * (2 if self.output in ("mask", "released") else 1)
@@ -96,19 +96,3 @@ class NeuMIPSpec:
             depth_scale=self.depth_scale,
             wrap=header.wrap == "wrap",
         )
-
-
-def sizes(size: tuple[int, int], levels: int) -> tuple[tuple[int, int], ...]:
-    """(h, w) of each level of a pyramid, halved and rounded down, never below 1."""
-    return tuple((max(size[0] >> s, 1), max(size[1] >> s, 1)) for s in range(levels))
-
-
-def most_levels(size: tuple[int, int]) -> int:
-    """Levels of a pyramid that ends in one texel."""
-    return max(size).bit_length()
-
-
-def _level_of(size: tuple[int, int], grid: tuple[int, int]) -> float:
-    """Level of the data's grid that a texture of `size` resolves, 0 or more."""
-    ratio = math.sqrt(grid[0] * grid[1] / (size[0] * size[1]))
-    return max(math.log2(ratio), 0.0)
