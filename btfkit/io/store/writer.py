@@ -1,20 +1,17 @@
 """Writing the native store: in parallel, resumable, whole under its name or not at all.
 
-The store grows in `.NAME.partial` beside its final name. A shard is the unit of work: one
-worker decodes the run of pairs of one shard, writes it and notes it in a journal. A later
-run with the same source and options goes on from the journal; when all shards are there
-the folder is renamed. A lock keeps a second run out as long as the first lives.
+A shard is the unit of work: one worker decodes the run of pairs of one shard, writes it and notes
+it in the journal. A later run with the same source and options goes on from there (see
+`btfkit.journal`); when all shards are there the folder is renamed.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -29,11 +26,11 @@ from btfkit.btf import BTF, QUANTITY
 from btfkit.errors import BtfkitError
 from btfkit.files import refuse_existing, replace_folder
 from btfkit.io.store.reader import IMAGE_AXES, VERSION, shard_path
+from btfkit.journal import Journal, alone, partial_folder, to_disk
 from btfkit.textures import HALF_RANGE, Textures, as_textures
 
 # Bytes of textures in one shard: what a worker holds, and what an interruption can lose.
 _SHARD_BYTES = 32 << 20
-_JOURNAL = "journal.jsonl"
 
 
 class HalfRangeError(BtfkitError):
@@ -67,7 +64,7 @@ def write(
         BtfkitError: `dtype` is "float16" and a value exceeds 6e4, or another run writes it.
     """
     final = refuse_existing(path, force=force)
-    with _alone(final):
+    with alone(final):
         if dtype is None and _begun(btf, final, "float32"):
             # An earlier run found that half does not do.
             return _write(btf, final, "float32", jobs, progress)
@@ -77,32 +74,6 @@ def write(
             if dtype is not None:
                 raise
             return _write(btf, final, "float32", jobs, progress)
-
-
-@contextmanager
-def _alone(final: Path) -> Iterator[None]:
-    """Nobody else writes `final` meanwhile; a killed process lets go of its lock.
-
-    Raises:
-        BtfkitError: another process does.
-    """
-    try:
-        import fcntl
-    except ImportError:  # Windows: two runs at once are up to the user
-        yield
-        return
-    path = final.with_name(f".{final.name}.lock")
-    with path.open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise BtfkitError(
-                f"{final}: another run is writing it", remedy="wait for it or end it"
-            ) from error
-        try:
-            yield
-        finally:
-            path.unlink(missing_ok=True)
 
 
 def _write(
@@ -152,6 +123,7 @@ class _Job:
     """One store being written: its folder, its arrays and its journal."""
 
     folder: Path
+    journal: Journal
     btf: BTF
     images: dict[str, tuple[Textures, zarr.Array[Any]]]
     run: int
@@ -159,23 +131,26 @@ class _Job:
     @staticmethod
     def begin(btf: BTF, final: Path, dtype: str) -> _Job:
         """Open the partial folder: the earlier one where it is of the same job, or a new one."""
-        folder = _partial(final)
-        if not _begun(btf, final, dtype):
+        folder = partial_folder(final)
+        journal = Journal(folder)
+        if _begun(btf, final, dtype):
+            journal.go_on()
+        else:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
             _create(folder, btf, dtype)
-            _append(folder, _identity(btf, dtype))
+            journal.begin(_identity(btf, dtype))
         group = zarr.open_group(folder, mode="r+", zarr_format=3)
         images: dict[str, tuple[Textures, zarr.Array[Any]]] = {}
         for name, textures in _images(btf).items():
             array = group[name]
             if isinstance(array, zarr.Array):  # a group by that name cannot be: `_create`
                 images[name] = (textures, array)
-        return _Job(folder, btf, images, _run_length(btf, dtype))
+        return _Job(folder, journal, btf, images, _run_length(btf, dtype))
 
     def missing(self) -> list[range]:
         """Runs of pairs that no journal line says are written."""
-        written = {entry["shard"] for entry in _journal(self.folder)[1:]}
+        written = {entry["shard"] for entry in self.journal.entries()}
         n = len(self.btf)
         runs = [range(start, min(start + self.run, n)) for start in range(0, n, self.run)]
         return [run for shard, run in enumerate(runs) if shard not in written]
@@ -198,35 +173,28 @@ class _Job:
                     )
                 block[slot] = np.where(finite, image, np.nan)
             array[run.start : run.stop] = block
-            _sync(shard_path(self.folder / name, run.start // self.run))
-        _append(self.folder, {"shard": run.start // self.run, "masked": masked})
+            to_disk(shard_path(self.folder / name, run.start // self.run))
+        self.journal.note({"shard": run.start // self.run, "masked": masked})
         return len(run)
 
     def finish(self, final: Path) -> None:
         """Note how many texels are masked, drop the journal and give the store its name."""
-        masked = sum(entry["masked"] for entry in _journal(self.folder)[1:])
+        masked = sum(entry["masked"] for entry in self.journal.entries())
         zarr.open_group(self.folder, mode="r+", zarr_format=3).attrs["masked_texels"] = masked
         # The journal goes last: a run killed in between has nothing to do again.
         replace_folder(self.folder, final)
-        with suppress(FileNotFoundError):
-            (final / _JOURNAL).unlink()
-
-
-def _partial(final: Path) -> Path:
-    return final.with_name(f".{final.name}.partial")
+        Journal(final).remove()
 
 
 def _identity(btf: BTF, dtype: str) -> dict[str, Any]:
-    """What two runs must share for one to go on with the other's work, as JSON gives it back."""
-    identity = {
+    """What two runs must share for one to go on with the other's work."""
+    return {
         "dtype": dtype,
         "shape": list(btf.shape),
         "run": _run_length(btf, dtype),
         "poses": _digest(btf.light, btf.view, btf.light_position, btf.view_position),
         "attributes": _attributes(btf),
     }
-    same: dict[str, Any] = json.loads(json.dumps(identity))
-    return same
 
 
 def _digest(*arrays: NDArray[Any] | None) -> str:
@@ -238,8 +206,7 @@ def _digest(*arrays: NDArray[Any] | None) -> str:
 
 def _begun(btf: BTF, final: Path, dtype: str) -> bool:
     """Whether an earlier run has begun the same store."""
-    journal = _journal(_partial(final))
-    return bool(journal) and journal[0] == _identity(btf, dtype)
+    return Journal(partial_folder(final)).of_job(_identity(btf, dtype))
 
 
 def _images(btf: BTF) -> dict[str, Textures]:
@@ -318,29 +285,3 @@ def _attributes(btf: BTF) -> dict[str, Any]:
         "source": dict(btf.provenance),
         "history": list(btf.history),
     }
-
-
-def _journal(folder: Path) -> list[dict[str, Any]]:
-    """What was finished so far; a last line cut short by a crash does not count."""
-    path = folder / _JOURNAL
-    if not path.is_file():
-        return []
-    entries = []
-    for line in path.read_bytes().split(b"\n")[:-1]:
-        try:
-            entries.append(json.loads(line))
-        except ValueError:
-            break
-    return entries
-
-
-def _append(folder: Path, entry: dict[str, Any]) -> None:
-    # One write call a line: lines of several workers do not mix.
-    with (folder / _JOURNAL).open("ab", buffering=0) as file:
-        file.write(json.dumps(entry).encode() + b"\n")
-        os.fsync(file.fileno())
-
-
-def _sync(path: Path) -> None:
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
