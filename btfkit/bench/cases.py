@@ -10,9 +10,11 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit import io, sources
 from btfkit.btf import BTF
 from btfkit.fitting.fit import split
 from btfkit.footprint import blur_of, blurred, gaussian, most_levels, of_level
+from btfkit.io import queryfile
 from btfkit.materials.evaluation import texel_centres
 from btfkit.queries import QuerySet
 from btfkit.textures import HALF_RANGE, as_textures
@@ -105,8 +107,6 @@ def procedural(name: str, *, size: int, directions: int, seed: int) -> Case:
 
 def stored(path: Path, *, holdout: float, seed: int) -> Case:
     """A store, or anything that `btfkit.open` reads: the pairs that `fit` would hold out."""
-    from btfkit import io
-
     btf = io.open(path)
     train, test = split(len(btf), holdout, seed)
     shown = np.random.default_rng(seed).permutation(test)[:_PICTURES]
@@ -119,8 +119,6 @@ def asked(path: Path, *, holdout: float, seed: int) -> Case:
     Raises:
         ValueError: the file has no answers, or no held-out row can be compared with.
     """
-    from btfkit.io import queryfile
-
     queries = queryfile.read(path)
     if queries.rgb is None:
         raise ValueError(f"{path} has no answers (rgb): there is nothing to fit")
@@ -138,9 +136,6 @@ def name_of(source: str | Path) -> str:
 
 def rows_of(path: Path) -> int | None:
     """Rows of the grid of a store or query file; None where queries do not say."""
-    from btfkit import io
-    from btfkit.io import queryfile
-
     if not has_queries(path):
         return io.open(path).shape[1]
     size = queryfile.read(path).size
@@ -148,8 +143,8 @@ def rows_of(path: Path) -> int | None:
 
 
 def has_queries(path: Path) -> bool:
-    """Whether a source is a query file, by its name."""
-    return path.suffix.lower() == ".npz"
+    """Whether a source is a query file."""
+    return sources.kind_of(path) == "queries"
 
 
 def _case(name: str, train: BTF, pictures: BTF) -> Case:

@@ -15,12 +15,12 @@ from btfkit.cli.outcome import Outcome, verb
 @click.argument("source", type=click.Path(path_type=Path))
 def eval_verb(bar: Bar, *, model: Path, source: Path) -> Outcome:
     """Errors of MODEL on SOURCE, a BTF or a query file with answers."""
+    from btfkit import sources
     from btfkit.btf import BTF
-    from btfkit.cli.sources import material_of, read_source
     from btfkit.materials import evaluation
     from btfkit.queries import QuerySet
 
-    material, truth = material_of(model), read_source(source)
+    material, truth = sources.material(model), sources.measured(source)
     if isinstance(truth, BTF):
         errors = evaluation.errors_on_btf(material, truth, progress=bar)
     elif isinstance(truth, QuerySet):

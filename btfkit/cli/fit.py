@@ -65,9 +65,9 @@ def fit_verb(
     SOURCE: a native store, anything `btfkit ingest` reads, a relief file or a query file.
     Writes the model and OUT.report.json beside it. Ctrl-C keeps the best state so far.
     """
-    from btfkit.cli.sources import read_source
     from btfkit.fitting import MODELS
     from btfkit.fitting.fit import fit
+    from btfkit.sources import measured
 
     if model != "auto" and model not in MODELS:
         raise ValueError(f"no model {model!r}; there are auto, {', '.join(MODELS)}")
@@ -75,7 +75,7 @@ def fit_verb(
         Path().glob("*.btf.zarr"), what="stores", remedy="name one: btfkit fit STORE"
     )
     report = fit(
-        read_source(path),
+        measured(path),
         model=model,
         budget_s=budget,
         steps=steps,

@@ -61,22 +61,23 @@ def installation() -> dict[str, Any]:
 
 def described(path: Path) -> dict[str, Any]:
     """What a store, a readable source, a model, a relief or a query file says of itself."""
+    from btfkit import sources
     from btfkit.btf import BTF
-    from btfkit.cli.sources import read_source
     from btfkit.queries import QuerySet
 
-    if path.suffix == ".safetensors":
+    kind = sources.kind_of(path)
+    if kind == "model":
         from btfkit.materials.file import header_of
 
-        return {"kind": "model", "bytes": path.stat().st_size, **header_of(path)}
-    found = read_source(path)
+        return {"kind": kind, "bytes": path.stat().st_size, **header_of(path)}
+    found = sources.measured(path)
     if isinstance(found, BTF):
-        return {"kind": "btf", "path": path, **_of_btf(found)}
+        return {"kind": kind, "path": path, **_of_btf(found)}
     if isinstance(found, QuerySet):
-        return {"kind": "queries", "path": path, **_of_queries(found)}
+        return {"kind": kind, "path": path, **_of_queries(found)}
     h, w = found.height.shape
     return {
-        "kind": "relief",
+        "kind": kind,
         "path": path,
         "size": (h, w),
         "height": (float(np.nanmin(found.height)), float(np.nanmax(found.height))),

@@ -20,12 +20,12 @@ from btfkit.cli.outcome import Outcome, verb
 @force_option
 def query_verb(bar: Bar, *, model: Path, queries: Path, out: Path, force: bool) -> Outcome:
     """Evaluate MODEL on a query file; OUT holds the queries with `rgb` and `opacity` added."""
-    from btfkit.cli.sources import material_of
+    from btfkit import sources
     from btfkit.files import refuse_existing
     from btfkit.io import queryfile
 
     refuse_existing(out, force=force)
-    material, asked = material_of(model), queryfile.read(queries)
+    material, asked = sources.material(model), queryfile.read(queries)
     bar(0, len(asked))
     # Kernels are loaded for the first query there is: the time stated is that of the answers.
     material.evaluate([0.5, 0.5], [0, 0, 1], [0, 0, 1])

@@ -70,6 +70,7 @@ def render_verb(
     Angles are in the object's frame: x right, y up, z towards the viewer of --view 0,0; THETA from
     z, PHI from x towards y. A white surface that faces one --light is 1. A plane fills the picture.
     """
+    from btfkit import sources
     from btfkit.files import refuse_existing
     from btfkit.render import picture
     from btfkit.render.environment import Environment
@@ -83,7 +84,7 @@ def render_verb(
     final = out or Path(stem(source) + ".png")
     picture.check_name(final)
     refuse_existing(final, force=force)
-    material = _material(source, curved=shape != "plane")
+    material = sources.material(source, curved=shape != "plane")
     if env is not None or shape != "plane":
         # Such a picture needs most of the textures anyway.
         material = _at_hand(material)
@@ -139,23 +140,6 @@ def _directions(option: str, angles: tuple[tuple[float, float], ...]) -> Floats:
     if not np.isfinite(degrees).all():
         raise click.BadParameter("expected finite angles in degrees", param_hint=option)
     return from_angles(*np.radians(degrees).T)
-
-
-def _material(source: Path, *, curved: bool) -> Material:
-    """A model's or a BTF's material, or a traced relief, of which nothing juts out of a shape."""
-    import btfkit
-
-    if source.suffix.lower() == ".exr":
-        from btfkit.relief.file import read
-        from btfkit.relief.material import TracedRelief
-
-        relief = read(source)
-        return TracedRelief(relief.under_surface()[0] if curved else relief)
-    if source.suffix == ".safetensors":
-        return btfkit.load(source)
-    from btfkit.materials.measured.interpolation import Interpolation
-
-    return Interpolation.of(btfkit.open(source))
 
 
 def _at_hand(material: Material) -> Material:

@@ -6,9 +6,9 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from btfkit.errors import BtfkitError
+from btfkit import io, sources
+from btfkit.errors import BtfkitError, FormatError
 from btfkit.files import refuse_existing, whole
-from btfkit.io import images
 from btfkit.io.store import reader
 from btfkit.synthesis import Tiling
 
@@ -41,16 +41,18 @@ def tile_file(
         FileExistsError: `out` exists and `force` is False.
     """
     path = Path(source)
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file or folder")
+    try:
+        kind = sources.kind_of(path)
+    except FormatError:
+        kind = None
     final = refuse_existing(out if out is not None else tile_name(path), force=force)
-    if path.is_dir() and reader.detect(path):
+    if kind == "btf" and reader.detect(path):
         return _tile_store(path, final, force, progress), final
-    if path.suffix.lower() == ".safetensors":
+    if kind == "model":
         return _tile_model(path, final, force), final
-    if path.is_file() and images.is_image(path.name):
+    if kind in ("picture", "relief"):
         return _tile_picture(path, final, force), final
-    raise _declined(path)
+    raise _declined(path, kind)
 
 
 def tile_name(source: Path) -> Path:
@@ -63,16 +65,10 @@ def tile_name(source: Path) -> Path:
     return Path(f"{name}.tile")
 
 
-def _declined(path: Path) -> BtfkitError:
-    from btfkit import io
-
+def _declined(path: Path, kind: sources.Kind | None) -> BtfkitError:
     found, remedy = f"{path}: this {'folder' if path.is_dir() else 'file'}", None
-    try:
-        kind = io.detect(path)
-    except BtfkitError:
-        pass
-    else:
-        found = f"{path}: a BTF as {kind}"
+    if kind == "btf":
+        found = f"{path}: a BTF as {io.detect(path)}"
         remedy = f"make it a store first: btfkit ingest {path}"
     return BtfkitError(f"{found} cannot be tiled; expected {_KINDS}", remedy=remedy)
 

@@ -128,7 +128,7 @@ def test_a_full_disk_is_an_error_of_its_own(
     def full(path: Path) -> None:
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr(writer, "_sync", full)
+    monkeypatch.setattr(writer, "to_disk", full)
     assert call("ingest", store, "-o", tmp_path / "b.btf.zarr") == 1
     assert "No space left on device" in capsys.readouterr().err
     assert not (tmp_path / "b.btf.zarr").exists()
