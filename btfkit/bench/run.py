@@ -8,8 +8,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, final
 
-import numpy as np
-
 from btfkit.bench import kernels, plots, tables, targets
 from btfkit.bench.cases import (
     Case,
@@ -25,6 +23,7 @@ from btfkit.bench.machine import machine
 from btfkit.errors import BtfkitError
 from btfkit.files import whole
 from btfkit.fitting import MODELS
+from btfkit.jsonvalues import plain
 from btfkit.native.neural import available
 
 Progress = Callable[[float, float], None]
@@ -259,17 +258,4 @@ def _keep(folder: Path, cell: Cell, row: Mapping[str, Any], case: Case) -> None:
 def _write(path: Path, value: Mapping[str, Any]) -> None:
     path.parent.mkdir(exist_ok=True)
     with whole(path, force=True) as partial:
-        partial.write_text(json.dumps(_json(value), indent=1))
-
-
-def _json(value: Any) -> Any:
-    """JSON's own types; NaN and infinity become text."""
-    if isinstance(value, Mapping):
-        return {str(key): _json(item) for key, item in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_json(item) for item in value]
-    if isinstance(value, np.generic):
-        return _json(value.item())
-    if isinstance(value, float) and not np.isfinite(value):
-        return str(value)
-    return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
+        partial.write_text(json.dumps(plain(value), indent=1))

@@ -13,7 +13,8 @@ import click
 import numpy as np
 
 from btfkit.cli.bar import Bar
-from btfkit.cli.outcome import Outcome, plain, verb
+from btfkit.cli.outcome import Outcome, verb
+from btfkit.jsonvalues import plain
 
 _LIBRARIES = (
     "torch",

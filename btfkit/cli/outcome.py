@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import inspect
 import json
-import math
 import os
 import sys
 import traceback
@@ -18,6 +17,7 @@ from typing import Any, final
 import click
 
 from btfkit.cli.bar import Bar
+from btfkit.jsonvalues import plain
 
 DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 
@@ -154,18 +154,3 @@ def _say(outcome: Outcome, warned: list[str]) -> None:
 
 def _print_json(data: Mapping[str, Any]) -> None:
     click.echo(json.dumps(plain(data), allow_nan=False))
-
-
-def plain(value: Any) -> Any:
-    """`value` in JSON's own types: paths as text, arrays as lists, non-finite numbers as text."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return "nan" if math.isnan(value) else ("inf" if value > 0 else "-inf")
-    return value

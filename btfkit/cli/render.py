@@ -11,7 +11,8 @@ import click
 
 from btfkit.cli.bar import Bar
 from btfkit.cli.options import NumbersType, force_option, out_option, seed_option, stem
-from btfkit.cli.outcome import Outcome, plain, verb
+from btfkit.cli.outcome import Outcome, verb
+from btfkit.jsonvalues import plain
 
 if TYPE_CHECKING:
     from btfkit.materials.base import Material

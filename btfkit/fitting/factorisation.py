@@ -33,7 +33,7 @@ _FILLS = 3
 
 
 @final
-class Rows:
+class EncodedRows:
     """The values of a BTF in the factorised domain, block of pairs by block.
 
     Args:
@@ -93,7 +93,7 @@ class Rows:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Factors:
+class LowRank:
     """left @ right.T, the best approximation of its rank.
 
     Attributes:
@@ -119,13 +119,13 @@ class Factors:
 
 
 def factorised(
-    rows: Rows,
+    rows: EncodedRows,
     channels: tuple[int, ...],
     rank: int,
     *,
     passes: int,
     start: Floats | None = None,
-) -> Factors:
+) -> LowRank:
     """The leading components of some channels of a BTF.
 
     Args:
@@ -153,7 +153,7 @@ def factorised(
         left[place] = values @ basis
         energy += float(np.square(values, dtype=np.float64).sum())
     u, singular, v = np.linalg.svd(left.astype(np.float64), full_matrices=False)
-    return Factors(
+    return LowRank(
         (u * singular)[:, :rank].astype(np.float32),
         (basis @ v.T)[:, :rank].astype(np.float32),
         singular[:rank],
@@ -162,7 +162,7 @@ def factorised(
     )
 
 
-def _matrix(rows: Rows, channels: tuple[int, ...]) -> Iterator[tuple[slice, Floats]]:
+def _matrix(rows: EncodedRows, channels: tuple[int, ...]) -> Iterator[tuple[slice, Floats]]:
     """Rows of the matrix and their place in it, block by block."""
     c = len(channels)
     for pairs, values in rows:

@@ -20,6 +20,7 @@ from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.files import refuse_existing, whole
 from btfkit.fitting import CLOSED_FORM, MODELS, TRAINED
+from btfkit.jsonvalues import plain
 from btfkit.materials import file
 from btfkit.materials.base import Material
 from btfkit.materials.evaluation import errors_on_btf, errors_on_queries
@@ -329,16 +330,5 @@ def _write_report(report: FitReport, out: Path) -> None:
     name = out.with_name(out.name.removesuffix(".safetensors") + ".report.json")
     header = asdict(report.material.header)
     with whole(name, force=True) as partial:
-        text = json.dumps(_json({**report.as_dict(), "header": header}), indent=1)
+        text = json.dumps(plain({**report.as_dict(), "header": header}), indent=1)
         partial.write_text(text)
-
-
-def _json(value: Any) -> Any:
-    """JSON has no NaN and no infinity: they become text."""
-    if isinstance(value, Mapping):
-        return {key: _json(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_json(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return value

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.settings import parsed
+from btfkit.materials.base import Header
 from btfkit.materials.measured.blend import pair_arrays
-from btfkit.materials.measured.interpolation import Interpolation, header_of, spec_of
+from btfkit.materials.measured.interpolation import Interpolation, spec_of
 from btfkit.queries import QuerySet
 from btfkit.textures import HALF_RANGE
 
@@ -62,7 +63,7 @@ def interpolation(
     mask = None if valid.all() else valid
     if mask is not None:
         weights["texture.valid"] = mask
-    return Interpolation(spec_of(replace(btf, validity=mask)), weights, header_of(btf))
+    return Interpolation(spec_of(replace(btf, validity=mask)), weights, Header.of(btf))
 
 
 def images_of(source: BTF | QuerySet, model: str) -> BTF:

@@ -15,7 +15,6 @@ from btfkit.errors import FitError
 from btfkit.fitting.interpolation import images_of
 from btfkit.settings import parsed
 from btfkit.materials.base import Header
-from btfkit.materials.measured.interpolation import header_of
 from btfkit.materials.lambert import Lambert, LambertSpec
 from btfkit.queries import QuerySet
 
@@ -49,7 +48,7 @@ def lambert(
         (product, square), header = _of_queries(source)
     else:
         product, square = _of_images(images_of(source, "lambert"), progress)
-        header = header_of(source)
+        header = Header.of(source)
     known = square > 0
     if not known.any():
         raise FitError("no value is measured and lit from above the horizon")

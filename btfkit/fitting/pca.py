@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from btfkit.btf import BTF
 from btfkit.errors import FitError
-from btfkit.fitting.factorisation import Factors, Rows, factorised
+from btfkit.fitting.factorisation import LowRank, EncodedRows, factorised
 from btfkit.fitting.interpolation import images_of
 from btfkit.settings import parsed
 from btfkit.textures import HALF_RANGE
+from btfkit.materials.base import Header
 from btfkit.materials.measured.blend import pair_arrays
-from btfkit.materials.measured.interpolation import header_of
 from btfkit.materials.measured.pca import PCA, Domain, PCASpec
 from btfkit.queries import QuerySet
 
@@ -77,7 +77,7 @@ def pca(
     groups: list[tuple[int, ...]] = [tuple(range(c))]
     if s.layout == "channels":
         groups = [(k,) for k in range(c)]
-    rows = Rows(
+    rows = EncodedRows(
         btf,
         "log" if s.domain == "log" else "linear",
         s.floor,
@@ -120,7 +120,7 @@ def _asked(
     return [min(max(share[0], 1), limit) for limit in most], left
 
 
-def _ranks(s: Settings, found: list[Factors], wanted: list[int], budget: float) -> list[int]:
+def _ranks(s: Settings, found: list[LowRank], wanted: list[int], budget: float) -> list[int]:
     if s.error:
         return [factors.rank_for(s.error) for factors in found]
     if not s.bytes:
@@ -145,7 +145,7 @@ def _packed(
     btf: BTF,
     s: Settings,
     measured: NDArray[np.bool_],
-    found: list[Factors],
+    found: list[LowRank],
     ranks: list[int],
 ) -> PCA:
     n, h, w, c = btf.shape
@@ -162,4 +162,4 @@ def _packed(
     spec = PCASpec(
         int(measured.sum()), (h, w), c, tuple(ranks), domain, s.floor, positions
     )  # fmt: skip
-    return PCA(spec, arrays, header_of(btf))
+    return PCA(spec, arrays, Header.of(btf))

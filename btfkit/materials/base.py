@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from btfkit import queries
-from btfkit.btf import QUANTITY, RGB, Wrap
+from btfkit.btf import BTF, QUANTITY, RGB, Wrap
 from btfkit.native.prepare import Prepared, prepare
 from btfkit.queries import Query, Response
 
@@ -54,6 +54,18 @@ class Header:
             raise ValueError(f"channels = {self.channels}; expected one name a channel")
         if self.wrap not in ("wrap", "clamp"):
             raise ValueError(f"wrap = {self.wrap!r}; expected 'wrap' or 'clamp'")
+
+    @staticmethod
+    def of(btf: BTF) -> Header:
+        """What a material of a BTF says about itself."""
+        return Header(
+            grid=btf.shape[1:3],
+            channels=btf.channels,
+            wrap=btf.wrap,
+            texel_mm=btf.texel_mm,
+            licence=btf.licence,
+            provenance=dict(btf.provenance),
+        )
 
     @property
     def aspect(self) -> float:

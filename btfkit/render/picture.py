@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from btfkit.errors import FormatError
 from btfkit.files import whole
 from btfkit.io import images
-from btfkit.render.preview import Picture
+from btfkit.render.preview import Rendering
 
 Array = NDArray[np.float32]
 # ITU-R BT.709, linear.
@@ -62,7 +62,7 @@ def check_name(path: Path) -> None:
 
 
 def write(
-    picture: Picture,
+    picture: Rendering,
     path: Path,
     *,
     channels: Sequence[str],

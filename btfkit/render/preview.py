@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from btfkit.materials.base import Material
 from btfkit.render.environment import Environment
 from btfkit.render.gaze import Gaze, gaze
-from btfkit.render.sampling import Samples
+from btfkit.render.sampling import PixelSamples
 from btfkit.render.shadows import Shadows
 from btfkit.shapes.camera import Camera
 from btfkit.shapes.closed import NEAR, Floats, Meeting, Plane, Shape, Surface
@@ -47,7 +47,7 @@ class Scene:
     environment: Environment | None = None
 
 
-class Picture(NamedTuple):
+class Rendering(NamedTuple):
     """What the eye sees.
 
     Attributes:
@@ -95,7 +95,7 @@ def render(
     samples: int = 1,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
-) -> Picture:
+) -> Rendering:
     """Render a picture.
 
     Args:
@@ -108,7 +108,9 @@ def render(
     """
     h, w = size
     c = len(scene.material.header.channels)
-    painter = _Painter(scene, camera_of(scene.shape, view, size), Samples(size, samples, seed=seed))
+    painter = _Painter(
+        scene, camera_of(scene.shape, view, size), PixelSamples(size, samples, seed=seed)
+    )
     radiance, cover = np.zeros((h * w, c), np.float32), np.zeros(h * w, np.float32)
     step = max(_BLOCK // samples, 1)
     for start in range(0, h * w, step):
@@ -125,14 +127,14 @@ def render(
             "they count as black",
             stacklevel=2,
         )
-    return Picture(radiance.reshape(h, w, c), cover.reshape(h, w), painter.asked)
+    return Rendering(radiance.reshape(h, w, c), cover.reshape(h, w), painter.asked)
 
 
 @final
 class _Painter:
     """Follows the rays of some pixels at a time, and counts what the material is asked."""
 
-    def __init__(self, scene: Scene, camera: Camera, drawn: Samples) -> None:
+    def __init__(self, scene: Scene, camera: Camera, drawn: PixelSamples) -> None:
         self._scene, self._camera, self._drawn = scene, camera, drawn
         # Samples share the pixel: each answers for its part.
         self._pixel = np.stack([camera.right, camera.down]) / np.sqrt(drawn.samples)

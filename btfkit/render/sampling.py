@@ -19,7 +19,7 @@ _MIX = (
 
 
 @final
-class Samples:
+class PixelSamples:
     """Low-discrepancy samples: the R2 sequence in every pixel; lights shifted between pixels.
 
     Args:

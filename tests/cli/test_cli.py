@@ -17,8 +17,9 @@ import pytest
 from btfkit.btf import BTF
 from btfkit.cli import VERBS, btfkit
 from btfkit.cli.options import DurationType, SettingType, SliceType, WindowType
-from btfkit.cli.outcome import plain, run
+from btfkit.cli.outcome import run
 from btfkit.io.store import writer
+from btfkit.jsonvalues import plain
 
 ENTRY = str(Path(sys.executable).with_name("btfkit"))
 

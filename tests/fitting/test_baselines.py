@@ -34,7 +34,7 @@ from btfkit.materials.measured.blend import Blend
 from btfkit.materials.measured.interpolation import Interpolation
 from btfkit.materials.measured.near import Near
 from btfkit.materials.measured.pca import decoded, encoded
-from btfkit.materials.measured.triangulation import Mesh, parabolic
+from btfkit.materials.measured.triangulation import DirectionMesh, parabolic
 from btfkit.materials.rainer import RainerSpec, decoder_shapes
 from btfkit.queries import QuerySet
 from btfkit.relief.synth import direction_set, synth_btf
@@ -78,7 +78,7 @@ def upper(rng: np.random.Generator, count: int) -> np.ndarray:
 @pytest.mark.parametrize("table", ["bonn81", "bonn151", "1", "2", "3", "40"])
 def test_every_direction_of_the_hemisphere_lies_in_a_triangle(table: str) -> None:
     measured = direction_set(table)
-    mesh = Mesh(measured)
+    mesh = DirectionMesh(measured)
     rng = np.random.default_rng(0)
     z = np.concatenate([rng.random(3000), np.zeros(500), [1.0]])
     azimuth = rng.random(len(z)) * 2 * np.pi
@@ -97,7 +97,7 @@ def test_every_direction_of_the_hemisphere_lies_in_a_triangle(table: str) -> Non
 
 def test_blending_reproduces_a_linear_function_within_the_measured_directions() -> None:
     measured = direction_set("bonn81")
-    mesh, rng = Mesh(measured), np.random.default_rng(1)
+    mesh, rng = DirectionMesh(measured), np.random.default_rng(1)
     query = upper(rng, 4000)
     # within the lowest ring's polygon no corner is one that stands for another
     query = query[query[:, 2] > np.cos(np.radians(70))]
@@ -111,7 +111,7 @@ def test_weights_are_those_of_scipy() -> None:
     rng = np.random.default_rng(2)
     # generic points have one Delaunay triangulation, so both must find it
     measured = upper(rng, 60)
-    mesh, values = Mesh(measured), rng.random(60)
+    mesh, values = DirectionMesh(measured), rng.random(60)
     query = upper(rng, 5000)
     row, weight = mesh.weights(query)
     ours = np.sum(weight * values[row], axis=1)
@@ -134,7 +134,7 @@ def test_blending_is_continuous(direction: np.ndarray, azimuth: float) -> None:
     assert abs(here - there) < 1e-4
 
 
-_MESH = Mesh(direction_set("40"))
+_MESH = DirectionMesh(direction_set("40"))
 
 
 def lists(kind: str) -> tuple[np.ndarray, np.ndarray]:

@@ -27,7 +27,7 @@ from btfkit.queries import Query
 from btfkit.render import picture
 from btfkit.render.environment import Environment
 from btfkit.render.gaze import gaze
-from btfkit.render.preview import Picture, Scene, camera_of, enough_samples, render
+from btfkit.render.preview import Rendering, Scene, camera_of, enough_samples, render
 from btfkit.shapes import obj
 from btfkit.shapes.catalogue import shape_of
 from btfkit.shapes.closed import Meeting, Shape
@@ -101,7 +101,7 @@ def towards(theta: float, phi: float) -> np.ndarray:
 
 def pictured(
     material: Material, shape: Shape | str, light: Any = ABOVE, view: Any = ABOVE, **options: Any
-) -> Picture:
+) -> Rendering:
     if isinstance(shape, str):
         shape = shape_of(shape)
     return render(Scene(material, shape, np.reshape(light, (-1, 3))), view=view, **options)
@@ -811,7 +811,7 @@ def test_an_exr_says_what_it_shows(
 
 def test_a_png_is_exposed_over_its_background(tmp_path: Path) -> None:
     radiance = np.full((1, 2, 3), 0.125, np.float32)
-    half = Picture(radiance, np.array([[1.0, 0.5]], np.float32), 0)
+    half = Rendering(radiance, np.array([[1.0, 0.5]], np.float32), 0)
     path = tmp_path / "a.png"
     picture.write(half, path, channels=("R", "G", "B"), exposure=1.0, background=(1, 0.5, 0))
     values = images.read("a.png", path.read_bytes(), transfer="srgb")

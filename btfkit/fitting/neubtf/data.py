@@ -77,7 +77,7 @@ def first_latents(images: NDArray[Any], count: int, *, deviation: float, seed: i
 
 
 @final
-class Directions:
+class PairDirections:
     """Light and view of pairs at texels: shared by all texels far away, per texel near."""
 
     def __init__(self, btf: BTF) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, ClassVar, final
 
 import numpy as np
@@ -25,7 +26,7 @@ from btfkit.fitting.neubtf import augment
 from btfkit.fitting.neubtf.guides import Guide, Guides, Window, encode
 from btfkit.fitting.interpolation import images_of
 from btfkit.fitting.loop import Generators, Trainable, restore_tensors, tensors_of
-from btfkit.fitting.neubtf.data import Directions, HeldOut, first_latents, frontal_slice
+from btfkit.fitting.neubtf.data import PairDirections, HeldOut, first_latents, frontal_slice
 from btfkit.fitting.neubtf.settings import Settings
 from btfkit.fitting.pool import Pool
 from btfkit.settings import parsed
@@ -62,7 +63,7 @@ class NeuBTF(Trainable):
             btf, train, seed=generators.seed, most_bytes=s.pool_mb << 20, progress=progress
         )
         self.masked = self._pool.masked
-        self._directions = Directions(btf)
+        self._directions = PairDirections(btf)
         self._held = HeldOut(btf, test)
         self._frontal = frontal_slice(btf, train)
         self._guides = Guides(
@@ -136,13 +137,7 @@ class NeuBTF(Trainable):
         weights["texture"] = (
             texture.reshape(*self.spec.size, -1).numpy().astype(self.settings.precision)
         )
-        header = Header(
-            grid=self.spec.size,
-            channels=self._btf.channels,
-            wrap=self._btf.wrap,
-            texel_mm=self._btf.texel_mm,
-            licence=self._btf.licence,
-        )
+        header = replace(Header.of(self._btf), grid=self.spec.size)
         return evaluated.NeuBTF(self.spec, weights, header)
 
     def training_arrays(self) -> dict[str, NDArray[Any]]:

@@ -22,7 +22,6 @@ from btfkit.settings import parsed
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip import arrays as neumip_arrays
 from btfkit.materials.base import Header, Material
-from btfkit.materials.measured.interpolation import header_of
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.footprint import most_levels
 from btfkit.native.neural.layout import Array, Layout
@@ -152,7 +151,7 @@ def tensors(batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
 
 def _header(source: BTF | QuerySet, settings: Settings) -> Header:
     if isinstance(source, BTF):
-        return header_of(source)
+        return Header.of(source)
     if source.size is None:
         if source.footprint is not None:
             raise FitError(

@@ -21,7 +21,7 @@ _LEAST_DEVIATION = 1e-3
 
 
 @final
-class Samples:
+class ProbedTexels:
     """One material's data.
 
     Args:

@@ -25,11 +25,11 @@ from btfkit.fitting import losses
 from btfkit.fitting.rainer.networks import Decoder, SetEncoder, TableEncoder
 from btfkit.fitting.interpolation import images_of
 from btfkit.fitting.loop import Generators, Trainable, restore_tensors, tensors_of
-from btfkit.fitting.rainer.samples import Samples
+from btfkit.fitting.rainer.samples import ProbedTexels
 from btfkit.settings import parsed
+from btfkit.materials.base import Header
 from btfkit.materials import file
 from btfkit.materials import rainer as evaluated
-from btfkit.materials.measured.interpolation import header_of
 from btfkit.materials.rainer import RainerSpec
 
 # Texels encoded at once for the finished texture.
@@ -106,10 +106,10 @@ class _Rainer(Trainable):
         self._generators = generators
         others = self._others(btf, others)
         sources = [(btf, train), *((b, np.arange(len(b))) for b in others)]
-        self._headers = [header_of(source) for source, _ in sources]
+        self._headers = [Header.of(source) for source, _ in sources]
         share = (s.pool_mb << 20) // len(sources)
         self._data = [
-            Samples(
+            ProbedTexels(
                 source, pairs, seed=generators.seed, probes=s.probes, whitened=self.whitened,
                 most_bytes=share, progress=progress,
             )
@@ -253,13 +253,13 @@ class _Rainer(Trainable):
 
     # --- encoding and decoding -------------------------------------------------------------
 
-    def _encoded(self, data: Samples, texels: Tensor, probes: Tensor | None) -> Tensor:
+    def _encoded(self, data: ProbedTexels, texels: Tensor, probes: Tensor | None) -> Tensor:
         """(t, latents) codes of texels, from some or all probes."""
         values, light, view = data.probed(texels, probes)
         return self.encoder(values, light, view)
 
     def _predict(
-        self, data: Samples, codes: Tensor, pairs: NDArray[np.intp], texels: Tensor
+        self, data: ProbedTexels, codes: Tensor, pairs: NDArray[np.intp], texels: Tensor
     ) -> Tensor:
         """(k, t, c) log(1 + value) of texels (t,) under pairs (k,)."""
         light, view = data.directions(pairs, texels)

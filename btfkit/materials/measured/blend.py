@@ -13,7 +13,7 @@ from btfkit import directions, nearfield
 from btfkit.btf import BTF
 from btfkit.directions import Floats
 from btfkit.materials.measured.near import Near
-from btfkit.materials.measured.triangulation import Mesh, parabolic
+from btfkit.materials.measured.triangulation import DirectionMesh, parabolic
 
 Array = NDArray[np.float32]
 Index = NDArray[np.intp]
@@ -84,8 +84,8 @@ class Blend:
     def _nest(
         self, pairs: Index, outer: Array, which: Index, inner: Array, which_inner: Index
     ) -> None:
-        self._outer = Mesh(outer)
-        self._meshes: list[tuple[Mesh, Index]] = []
+        self._outer = DirectionMesh(outer)
+        self._meshes: list[tuple[DirectionMesh, Index]] = []
         self._home = np.empty((len(outer), 2), np.intp)
         groups: dict[bytes, tuple[Index, list[Index]]] = {}
         for row in range(len(outer)):
@@ -95,7 +95,7 @@ class Blend:
             self._home[row] = list(groups).index(partners.tobytes()), len(group[1])
             group[1].append(pairs[members[first]])
         for partners, lists in groups.values():
-            self._meshes.append((Mesh(inner[partners]), np.stack(lists)))
+            self._meshes.append((DirectionMesh(inner[partners]), np.stack(lists)))
 
     def weights(
         self, light: Array, view: Array, at: NDArray[np.floating] | None = None

@@ -81,7 +81,7 @@ class Interpolation(Material):
         weights: dict[str, Any] = {"texture": btf.textures, **pair_arrays(btf)}
         if btf.validity is not None:
             weights["texture.valid"] = btf.validity
-        return Interpolation(spec_of(btf), weights, header_of(btf))
+        return Interpolation(spec_of(btf), weights, Header.of(btf))
 
     @classmethod
     def shapes(cls, spec: InterpolationSpec, header: Header) -> dict[str, tuple[int, ...]]:
@@ -147,15 +147,3 @@ def spec_of(btf: BTF) -> InterpolationSpec:
     positions = tuple(name for name in pair_arrays(btf) if name.endswith("_position"))
     valid = 0 if btf.validity is None else len(btf.validity)
     return InterpolationSpec(n, (h, w), c, valid, positions)
-
-
-def header_of(btf: BTF) -> Header:
-    """What a material of a BTF says about itself."""
-    return Header(
-        grid=btf.shape[1:3],
-        channels=btf.channels,
-        wrap=btf.wrap,
-        texel_mm=btf.texel_mm,
-        licence=btf.licence,
-        provenance=dict(btf.provenance),
-    )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from btfkit import directions
 from btfkit.directions import Floats
-from btfkit.materials.measured.triangulation import Mesh
+from btfkit.materials.measured.triangulation import DirectionMesh
 
 Array = NDArray[np.float32]
 # Solving for the equivalent direction converges by texel size / distance to the lamp each time.
@@ -29,7 +29,7 @@ class Near:
     """
 
     position: Array
-    mesh: Mesh
+    mesh: DirectionMesh
     distance: Floats
 
     @staticmethod
@@ -43,7 +43,7 @@ class Near:
         _, first = np.unique(which, return_index=True)
         return Near(
             np.asarray(position, np.float32),
-            Mesh(table),
+            DirectionMesh(table),
             np.linalg.norm(above[first].astype(float), axis=1),
         )
 

@@ -28,7 +28,7 @@ def parabolic(direction: ArrayLike) -> Floats:
 
 
 @final
-class Mesh:
+class DirectionMesh:
     """A Delaunay triangulation of directions of the upper hemisphere.
 
     Args:
