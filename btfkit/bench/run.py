@@ -92,18 +92,18 @@ def run(profile: Profile, folder: Path, *, progress: Progress | None = None) -> 
         **_kernels(folder, profile),
     }
     rows: list[dict[str, Any]] | None = None
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     # Another process may have finished cells meanwhile; the last to write has seen them all.
     while rows != (now := cells_in(folder, profile)):
         rows = now
-        found = {**further, "cells": rows, "targets": targets.targets(rows)}
-        _tell(folder, found)
-    return found
+        results = {**further, "cells": rows, "targets": targets.targets(rows)}
+        _report(folder, results)
+    return results
 
 
-def _tell(folder: Path, found: Mapping[str, Any]) -> None:
+def _report(folder: Path, results: Mapping[str, Any]) -> None:
     """Plots, tables and JSON of everything."""
-    good = [row for row in found["cells"] if "failed" not in row]
+    good = [row for row in results["cells"] if "failed" not in row]
     for name, draw in (
         ("rate-distortion.png", plots.rate_distortion),
         ("time-to-error.png", plots.time_to_error),
@@ -111,8 +111,8 @@ def _tell(folder: Path, found: Mapping[str, Any]) -> None:
         with whole(folder / name, force=True) as partial:
             draw(good, partial)
     with whole(folder / "bench.md", force=True) as partial:
-        partial.write_text(tables.markdown(found))
-    _write(folder / "bench.json", found)
+        partial.write_text(tables.markdown(results))
+    _write(folder / "bench.json", results)
 
 
 def cells_in(folder: Path, profile: Profile) -> list[dict[str, Any]]:
@@ -243,8 +243,8 @@ def _kernels(folder: Path, profile: Profile) -> dict[str, Any]:
                 "regions": kernels.region_table(seconds),
             },
         )
-    found: dict[str, Any] = json.loads(kept.read_text())
-    return found
+    results: dict[str, Any] = json.loads(kept.read_text())
+    return results
 
 
 def _file(folder: Path, cell: Cell) -> Path:

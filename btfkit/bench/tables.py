@@ -10,11 +10,11 @@ from btfkit.bench.machine import same
 Row = Mapping[str, Any]
 
 
-def markdown(found: Mapping[str, Any]) -> str:
+def markdown(results: Mapping[str, Any]) -> str:
     """Everything that bench.json holds, as a page."""
-    machine = found["machine"]
+    machine = results["machine"]
     peak = machine["peak_gflops_one_thread"]
-    rows = found["cells"]
+    rows = results["cells"]
     parts = [
         "# btfkit bench\n",
         f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads; "
@@ -36,9 +36,9 @@ def markdown(found: Mapping[str, Any]) -> str:
         ("What each skip saves", "skips"),
         ("Region of interest", "regions"),
     ):
-        if key in found:
-            parts += [f"## {title}\n", generic(found[key])]
-    parts += ["## Targets\n", generic(found["targets"])]
+        if key in results:
+            parts += [f"## {title}\n", generic(results[key])]
+    parts += ["## Targets\n", generic(results["targets"])]
     return "\n".join(part for part in parts if part) + "\n"
 
 

@@ -120,17 +120,17 @@ def _asked(
     return [min(max(share[0], 1), limit) for limit in most], left
 
 
-def _ranks(s: Settings, found: list[LowRank], wanted: list[int], budget: float) -> list[int]:
+def _ranks(s: Settings, parts: list[LowRank], wanted: list[int], budget: float) -> list[int]:
     if s.error:
-        return [factors.rank_for(s.error) for factors in found]
+        return [part.rank_for(s.error) for part in parts]
     if not s.bytes:
         return wanted
-    ranks = [1] * len(found)
-    each = [2 * sum(side.shape[0] for side in (f.left, f.right)) for f in found]
+    ranks = [1] * len(parts)
+    each = [2 * sum(side.shape[0] for side in (f.left, f.right)) for f in parts]
     left = budget - sum(each)
     # The component that explains most comes next, as long as there is room.
     rest = sorted(
-        ((value, k) for k, f in enumerate(found) for value in f.singular[1 : wanted[k]]),
+        ((value, k) for k, f in enumerate(parts) for value in f.singular[1 : wanted[k]]),
         reverse=True,
     )
     for _, k in rest:
@@ -145,12 +145,12 @@ def _packed(
     btf: BTF,
     s: Settings,
     measured: NDArray[np.bool_],
-    found: list[LowRank],
+    parts: list[LowRank],
     ranks: list[int],
 ) -> PCA:
     n, h, w, c = btf.shape
     arrays: dict[str, Any] = {name: a[measured] for name, a in pair_arrays(btf).items()}
-    for k, (factors, rank) in enumerate(zip(found, ranks, strict=True)):
+    for k, (factors, rank) in enumerate(zip(parts, ranks, strict=True)):
         # Each texture of coefficients reaches 1: half precision suits it, and its table.
         scale = np.maximum(np.abs(factors.right[:, :rank]).max(axis=0), 1e-20)
         table = (factors.left[:, :rank] * scale).reshape(n, -1, rank)[measured]

@@ -164,8 +164,8 @@ class NeuBTF(Material):
         return _mix(top, bottom, down)
 
 
-def _mix(first: Array, second: Array, share: Array) -> Array:
-    return first + (second - first) * share[:, None]
+def _mix(first: Array, second: Array, weight: Array) -> Array:
+    return first + (second - first) * weight[:, None]
 
 
 def _neighbours(

@@ -52,8 +52,8 @@ class Mesh(Shape):
     def surface(self, origin: Floats, direction: Floats, met: Meeting) -> Surface:
         face = met.part
         point = origin + met.distance[:, None] * direction
-        share = self._shares(point, face)
-        normal = np.einsum("ij,ijk->ik", share, self._normal[face])
+        weight = self._barycentric(point, face)
+        normal = np.einsum("ij,ijk->ik", weight, self._normal[face])
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         flat = self._flat[face]
         normal = np.where(length > 1e-6, normal / np.maximum(length, 1e-6), flat)
@@ -63,13 +63,13 @@ class Mesh(Shape):
             "ijk,ijk->ij", point[:, None] - self._corner[face], self._normal[face]
         )  # fmt: skip
         lift = np.minimum(below, 0)[..., None] * self._normal[face]
-        start = point - np.einsum("ij,ijk->ik", share, lift)
-        uv = np.einsum("ij,ijk->ik", share, self._uv[face])
+        start = point - np.einsum("ij,ijk->ik", weight, lift)
+        uv = np.einsum("ij,ijk->ik", weight, self._uv[face])
         return Surface(
             point, normal, flat, uv, self._du[face], self._dv[face], self._bend[face], start
         )
 
-    def _shares(self, point: Floats, face: Ints) -> Floats:
+    def _barycentric(self, point: Floats, face: Ints) -> Floats:
         """Barycentric coordinates (m, 3) of points on triangles."""
         first, second, third = np.moveaxis(self._corner[face], 1, 0)
         b, c = _solved(second - first, third - first, point - first)

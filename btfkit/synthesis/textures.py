@@ -13,7 +13,9 @@ from btfkit.synthesis.indexmap import IndexMap
 from btfkit.textures import Array, Index, Textures, as_textures
 
 
-def bent(image: Array, index: IndexMap, drift: Drift, strengths: NDArray[np.floating]) -> Array:
+def without_drift(
+    image: Array, index: IndexMap, drift: Drift, strengths: NDArray[np.floating]
+) -> Array:
     """(p, q, c) the tile of an image (h, w, c) without the drift of `strengths`."""
     row, col = drift.origin
     return index.of(image) * drift.gain(strengths)[index.rows - row, index.cols - col]
@@ -56,7 +58,7 @@ class TiledTextures(Textures):
 
     def _read(self, index: int) -> Array:
         strengths = self._power * self._strengths.of(index)
-        return bent(self._inner[index], self._index, self._drift, strengths)
+        return without_drift(self._inner[index], self._index, self._drift, strengths)
 
     def texels(self, pairs: Index, rows: Index, cols: Index) -> Array:
         row, col = self._index.rows[rows, cols], self._index.cols[rows, cols]

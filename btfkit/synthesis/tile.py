@@ -19,7 +19,7 @@ from btfkit.synthesis.indexmap import IndexMap
 from btfkit.synthesis.join import joined
 from btfkit.synthesis.period import Side, side_of
 from btfkit.synthesis.summary import Summary, spread_out
-from btfkit.synthesis.textures import Strengths, TiledTextures, bent
+from btfkit.synthesis.textures import Strengths, TiledTextures, without_drift
 
 Array = NDArray[np.float32]
 # Slices that are looked at for the one map of all.
@@ -101,7 +101,7 @@ def tile_image(image: Array) -> tuple[Array, Tiling]:
     tiling = _tiling(Summary.of([values]))
     tile = values
     if tiling.drift is not None:
-        tile = bent(values, tiling.index, tiling.drift, tiling.drift.strengths(values))
+        tile = without_drift(values, tiling.index, tiling.drift, tiling.drift.strengths(values))
     return tile, replace(tiling, seam_ratio=metrics.seam_ratio(tile))
 
 

@@ -189,7 +189,7 @@ class NeuBTF(Trainable):
         self._mean = weight.mean(dim=0)
         self._deviation = weight.std(dim=0, correction=0).clamp_min(1e-3)
 
-    def _step_latents(self, share: float) -> float:
+    def _step_latents(self, progress: float) -> float:
         s = self.settings
         h, w = self.spec.size
         # Larger textures want more texels a step, and as many samples at most.
@@ -204,18 +204,18 @@ class NeuBTF(Trainable):
         )
         self.queries += len(slots) * texels
         rates = {"latent_moments": s.latent_rate, "renderer_moments": s.renderer_rate}
-        return self._optimise(loss, rates, share)
+        return self._optimise(loss, rates, progress)
 
-    def _step_teach(self, share: float) -> float:
+    def _step_teach(self, progress: float) -> float:
         guide = self._guides.draw()
         wanted = ((self.latents.weight.detach() - self._mean) / self._deviation).T
         wanted = wanted.reshape(1, -1, *self.spec.size)
         wanted = self._guides.windowed(wanted, guide.window)
         wanted = augment.resized(wanted, guide.size, wrap=False)
         loss = F.smooth_l1_loss(self.encoder(guide.image), wanted)
-        return self._optimise(loss, {"encoder_moments": self.settings.encoder_rate}, share)
+        return self._optimise(loss, {"encoder_moments": self.settings.encoder_rate}, progress)
 
-    def _step_joint(self, share: float) -> float:
+    def _step_joint(self, progress: float) -> float:
         s = self.settings
         guide = self._guides.draw()
         size = guide.size
@@ -237,7 +237,7 @@ class NeuBTF(Trainable):
         if s.style or s.frequency:
             loss = loss + self._image_losses(texture, guide)
         rates = {"encoder_moments": s.encoder_rate / 2, "renderer_moments": s.renderer_rate / 2}
-        return self._optimise(loss, rates, share)
+        return self._optimise(loss, rates, progress)
 
     def _image_losses(self, texture: Tensor, guide: Guide) -> Tensor:
         """Style and focal frequency on one whole image of the crop, at most 96 x 96."""
@@ -257,9 +257,9 @@ class NeuBTF(Trainable):
             self.settings.frequency * losses.focal_frequency(image, target)
         )
 
-    def _optimise(self, loss: Tensor, rates: Mapping[str, float], share: float) -> float:
-        warm_up = min(1.0, (share + 1e-4) / 0.05)
-        factor = self._rate * warm_up * (0.5 + 0.5 * math.cos(math.pi * share)) + 1e-3
+    def _optimise(self, loss: Tensor, rates: Mapping[str, float], progress: float) -> float:
+        warm_up = min(1.0, (progress + 1e-4) / 0.05)
+        factor = self._rate * warm_up * (0.5 + 0.5 * math.cos(math.pi * progress)) + 1e-3
         for name, rate in rates.items():
             for group in self._optimisers[name].param_groups:
                 group["lr"] = rate * factor

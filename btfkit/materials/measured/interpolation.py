@@ -20,7 +20,7 @@ from btfkit.queries import Query
 GRAZING = 0.05
 # What a pair of weight 0 answers with where none that has weight is measured.
 _LAST_RESORT = 1e-3
-# Queries looked up at once: where textures are decoded, more of them share each decoding.
+# Queries looked up at once: where textures are decoded, more of them corner_weight each decoding.
 _BLOCK, _LAZY_BLOCK = 1 << 14, 1 << 17
 
 
@@ -105,27 +105,27 @@ class Interpolation(Material):
         if self._blend.near:
             at = uv_places(query.uv, self.spec.size, self.header.texel_mm or 1.0)
         pair, weight = self._blend.weights(query.light, query.view, at)
-        rows, cols, share = corners(query.uv, self.spec.size, self.header.wrap)
+        rows, cols, corner_weight = corners(query.uv, self.spec.size, self.header.wrap)
         falloff = np.maximum(query.light[:, 2:], GRAZING) / np.maximum(
             self._blend.cosines(pair, at), GRAZING
         )
-        value, found = self._gathered(pair, weight, rows, cols, share, falloff)
+        value, found = self._gathered(pair, weight, rows, cols, corner_weight, falloff)
         lost = np.flatnonzero((found <= 0).any(axis=1))
         if lost.size:
             again, found_again = self._gathered(
                 pair[lost], weight[lost] + _LAST_RESORT, rows[lost], cols[lost],
-                share[lost] + _LAST_RESORT, falloff[lost],
+                corner_weight[lost] + _LAST_RESORT, falloff[lost],
             )  # fmt: skip
             value[lost] = np.where(found[lost] > 0, value[lost], again)
             found[lost] = np.where(found[lost] > 0, found[lost], found_again)
         return np.where(found > 0, value / np.where(found > 0, found, 1), 0).astype(np.float32)
 
     def _gathered(
-        self, pair: Any, weight: Any, rows: Any, cols: Any, share: Any, falloff: Any
+        self, pair: Any, weight: Any, rows: Any, cols: Any, corner_weight: Any, falloff: Any
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Weighted sums (b, c) of what is measured, and of the weights that it has."""
         b, c = len(pair), self.spec.channels
-        total = weight[:, :, None] * share[:, None, :]
+        total = weight[:, :, None] * corner_weight[:, None, :]
         query, which, corner = np.nonzero(total)
         pairs = pair[query, which]
         values = self._btf.texels(pairs, rows[query, corner], cols[query, corner])

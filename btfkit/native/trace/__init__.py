@@ -21,10 +21,10 @@ from btfkit.native.trace.march import (
     Line,
     Patch,
     Point,
-    bent,
     corners,
     geometry,
-    sent,
+    intersect,
+    intersect_curved,
 )
 
 __all__ = ["Geometry", "Traced", "geometry", "trace", "trace_plain"]
@@ -115,28 +115,35 @@ def trace_plain(
     if curvature is None:
         curvature = np.zeros(count, np.float32)
     rgb: Floats = np.zeros((count, relief.channels), np.float32)
-    cover, seen = np.zeros(count, np.float32), np.zeros((count, 5), np.float32)
+    cover, met = np.zeros(count, np.float32), np.zeros(count, np.float32)
+    seen = [np.zeros(count, np.float32) for _ in ("column", "row", "height", "visible")]
     patch = _patch(curvature, view)
     query = np.arange(count, dtype=np.uint32)
     for index in range(samples):
         shift: Floats = np.zeros_like(place)
         if samples > 1:
             shift = _spread(query, index, samples, seed) * np.minimum(footprint, WIDEST)[:, None]
-        one, where = _sample(relief, patch, place + shift, light, view, bounces, query, index, seed)
-        met = where[:, 5]
-        rgb += where[:, :1] * one
-        cover += where[:, 0] * met
-        seen[:, :2] += (where[:, 1:3] - shift) * met[:, None]
-        seen[:, 2:4] += where[:, 3:5] * met[:, None]
-        seen[:, 4] += met
+        ray = _sample(relief, patch, place + shift, light, view, bounces, query, index, seed)
+        rgb += ray.opacity[:, None] * ray.rgb
+        cover += ray.opacity * ray.met
+        met += ray.met
+        saw: tuple[Floats, ...] = (
+            ray.column - shift[:, 0],
+            ray.row - shift[:, 1],
+            ray.height,
+            ray.visible,
+        )
+        for total, part in zip(seen, saw, strict=True):
+            total += part * ray.met
     with np.errstate(invalid="ignore", divide="ignore"):
         rgb = np.where(cover[:, None] > 0, rgb / cover[:, None], 0)
-        mean = seen[:, :4] / seen[:, 4:]
-    nowhere = np.concatenate([place, np.zeros_like(place)], axis=1)
-    mean = np.where(seen[:, 4:] > 0, mean, nowhere)
-    column, row, height, visible = (np.asarray(part, np.float32) for part in mean.T)
+        nowhere: tuple[Floats, ...] = (*place.T, np.zeros_like(met), np.zeros_like(met))
+        column, row, height, visible = (
+            np.asarray(np.where(met > 0, total / met, other), np.float32)
+            for total, other in zip(seen, nowhere, strict=True)
+        )
     n = np.float32(samples)
-    return Traced(rgb, cover / n, column, row, height, visible, seen[:, 4] / n)
+    return Traced(rgb, cover / n, column, row, height, visible, met / n)
 
 
 def _patch(curvature: Array, view: Array) -> Patch:
@@ -167,14 +174,16 @@ def _sample(
     query: NDArray[np.uint32],
     index: int,
     seed: int,
-) -> tuple[Floats, Floats]:
-    """One ray a query: reflectance (b, c); (b, 6) opacity, column, row, height, visible, met."""
-    hit = _looked(relief, patch, place, _lifted(view))
+) -> Traced:
+    """One ray a query, its reflectance not yet weighted by opacity."""
+    hit = _first_hit(relief, patch, place, _lifted(view))
     surface = _Surface.at(relief, patch, hit.at)
-    at, alive = hit.at, hit.found
-    where = np.stack(
-        [surface.opacity, at.i + at.a, at.j + at.b, at.z, np.zeros_like(at.z), alive], axis=1
-    ).astype(np.float32)
+    at, alive = hit.at, hit.met
+    column, row, height, opacity, met = (
+        np.array(part, np.float32)
+        for part in (at.i + at.a, at.j + at.b, at.z, surface.opacity, alive)
+    )
+    visible = np.zeros_like(height)
     # The plane goes on for ever and hides every light below its horizon; a cylinder does not.
     alive = alive & (surface.opacity > 0) & ((patch.k != 0) | (light[:, 2] > 0))
     rgb = np.zeros((len(place), relief.channels), np.float32)
@@ -184,29 +193,29 @@ def _sample(
         faces = alive & (_dot(surface.normal, light) > 0)
         towards = np.where((patch.k == 0)[:, None], _lifted(light), light)
         start = _above(at, surface.normal)
-        lit = faces & ~sent(relief, patch, start, towards, faces).found
+        lit = faces & ~intersect(relief, patch, start, towards, faces).met
         if bounce == 0:
-            where[lit, 4] = 1
+            visible[lit] = 1
         rgb[lit] += throughput[lit] * surface.take(lit).shaded(light[lit], outgoing[lit])
         if bounce == bounces:
             break
         onward = _onward(surface, query, index, bounce, seed)
         cosine = np.maximum(_dot(surface.normal, onward), np.float32(1e-6))
         throughput = throughput * surface.shaded(onward, outgoing) / cosine[:, None]
-        hit = sent(relief, patch, start, onward, alive)
+        hit = intersect(relief, patch, start, onward, alive)
         at, surface = hit.at, _Surface.at(relief, patch, hit.at)
         light, outgoing = patch.turned(light, hit.turn), patch.turned(-onward, hit.turn)
-        alive = alive & hit.found & (_dot(surface.normal, outgoing) > 0)
-    return rgb, where
+        alive = alive & hit.met & (_dot(surface.normal, outgoing) > 0)
+    return Traced(rgb, opacity, column, row, height, visible, met)
 
 
-def _looked(relief: Geometry, patch: Patch, place: Floats, v: Floats) -> Hit:
+def _first_hit(relief: Geometry, patch: Patch, place: Floats, v: Floats) -> Hit:
     """View rays through places on z = 0, from where they come into the layer of the relief."""
     count, up = len(place), relief.highest + np.float32(LIFT)
     slope = up / v[:, 2]
     level = np.full(count, up, np.float32)
     start = Point.over(place[:, 0] + v[:, 0] * slope, place[:, 1] - v[:, 1] * slope, level)
-    hit = sent(relief, patch, start, -v, patch.k == 0)
+    hit = intersect(relief, patch, start, -v, patch.k == 0)
     curved = np.flatnonzero(patch.k != 0)
     # |centre + t v| = 1/k + up; a concave patch may have no such t: the ray begins half-way across.
     p, v = patch.take(curved), v[curved]
@@ -220,10 +229,10 @@ def _looked(relief: Geometry, patch: Patch, place: Floats, v: Floats) -> Hit:
     p, line = p.take(comes), Line.of(p, zero.z, v).take(comes)
     begin = line.at(t[comes])
     from_ = zero.take(comes).moved(*p.steps(begin.s, begin.a), begin.rise)
-    found = bent(relief, p, from_, p.turned(-v[comes], begin.turn))
-    hit.found[rows] = found.found
-    hit.at.put(rows, found.at)
-    (c0, s0), (c1, s1) = begin.turn.T, found.turn.T
+    inside = intersect_curved(relief, p, from_, p.turned(-v[comes], begin.turn))
+    hit.met[rows] = inside.met
+    hit.at.put(rows, inside.at)
+    (c0, s0), (c1, s1) = begin.turn.T, inside.turn.T
     hit.turn[rows] = np.stack([c0 * c1 - s0 * s1, s0 * c1 + c0 * s1], axis=1)
     return hit
 

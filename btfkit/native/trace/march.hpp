@@ -77,7 +77,7 @@ inline Corners corners(const Relief& r, int i, int j) {
   return {h00, h10 - h00, h01 - h00, h11 - h10 - h01 + h00};
 }
 
-struct Hit { bool found; Point at; float t; };
+struct Hit { bool met; Point at; float t; };
 
 struct Ray {
   Point at;
@@ -197,10 +197,10 @@ struct Line {
   }
 };
 
-struct Bent { Hit hit; Turn turn; };
+struct CurvedHit { Hit hit; Turn turn; };
 
 // The same on a cylinder: its straight ray is a curve over the unrolled relief, followed in pieces.
-inline Bent march_bent(const Relief& r, const Patch& p, Point at, Vec d) {
+inline CurvedHit march_curved(const Relief& r, const Patch& p, Point at, Vec d) {
   const Line line(p, at.z, d);
   const float thin = std::min(1 + p.k * r.lowest, 1 + p.k * r.highest), bend = std::fabs(p.k);
   const float flat = std::max(std::sqrt(line.q), 1e-3f);
@@ -214,8 +214,8 @@ inline Bent march_bent(const Relief& r, const Patch& p, Point at, Vec d) {
     const float s = to.s - from.s, a = to.a - from.a;
     const float da = s * p.ex - a * p.ey, db = -(s * p.ey + a * p.ex), dz = to.dz - from.dz;
     Hit hit = march(r, {here, da, db, dz}, 1);
-    if (hit.found || at.z + to.dz < r.lowest) {
-      hit.found = true;
+    if (hit.met || at.z + to.dz < r.lowest) {
+      hit.met = true;
       return {hit, line.at(t - piece * (1 - hit.t)).turn};
     }
     here = moved(at, to.s * p.ex - to.a * p.ey, -(to.s * p.ey + to.a * p.ex), to.dz);

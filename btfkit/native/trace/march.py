@@ -151,7 +151,7 @@ class Patch(NamedTuple):
 class Hit(NamedTuple):
     """(b,) whether there is one, where, how far along the ray, and (b, 2) the turn of the frame."""
 
-    found: Bools
+    met: Bools
     at: Point
     t: Floats
     turn: Floats
@@ -168,7 +168,7 @@ def corners(relief: Geometry, i: Ints, j: Ints) -> list[tuple[Ints, Ints]]:
     return [(r, c) for r in rows for c in cols]
 
 
-def sent(relief: Geometry, patch: Patch, at: Point, d: Floats, alive: Bools) -> Hit:
+def intersect(relief: Geometry, patch: Patch, at: Point, d: Floats, alive: Bools) -> Hit:
     """Rays from points along (b, 3) directions of the frames there, until they hit or leave."""
     count = len(at.z)
     hit = Hit(
@@ -179,8 +179,12 @@ def sent(relief: Geometry, patch: Patch, at: Point, d: Floats, alive: Bools) -> 
         if not rows.size:
             continue
         some, p = at.take(rows), patch.take(rows)
-        one = _plane(relief, some, d[rows]) if p.k[0] == 0 else bent(relief, p, some, d[rows])
-        hit.found[rows], hit.t[rows], hit.turn[rows] = one.found, one.t, one.turn
+        one = (
+            _plane(relief, some, d[rows])
+            if p.k[0] == 0
+            else intersect_curved(relief, p, some, d[rows])
+        )
+        hit.met[rows], hit.t[rows], hit.turn[rows] = one.met, one.t, one.turn
         hit.at.put(rows, one.at)
     return hit
 
@@ -191,13 +195,13 @@ def _plane(relief: Geometry, at: Point, d: Floats) -> Hit:
         last = np.where(d[:, 2] < 0, down, np.where(d[:, 2] > 0, up, FAR))
     most = np.minimum(np.maximum(last, 0), FAR).astype(np.float32) + 1
     hit = march(relief, at, d[:, 0], -d[:, 1], d[:, 2], most)
-    fallen = ~hit.found & (d[:, 2] < 0)
-    hit.found[fallen] = True
+    fallen = ~hit.met & (d[:, 2] < 0)
+    hit.met[fallen] = True
     hit.at.z[fallen] = relief.lowest
     return hit
 
 
-def bent(relief: Geometry, patch: Patch, at: Point, d: Floats) -> Hit:
+def intersect_curved(relief: Geometry, patch: Patch, at: Point, d: Floats) -> Hit:
     """The same on cylinders, piece by piece."""
     line = Line.of(patch, at.z, d)
     bend = np.abs(patch.k)
@@ -216,9 +220,9 @@ def bent(relief: Geometry, patch: Patch, at: Point, d: Floats) -> Hit:
         da, db = p.steps(to.s - s[going], to.a - a[going])
         dz = to.rise - rise[going]
         one = march(relief, here.take(going), da, db, dz, np.ones_like(dz))
-        found = one.found | (at.z[going] + to.rise < relief.lowest)
+        found = one.met | (at.z[going] + to.rise < relief.lowest)
         met = going[found]
-        hit.found[met] = True
+        hit.met[met] = True
         here.put(met, one.at.take(found))
         back = t[met] - piece[met] * (1 - one.t[found])
         hit.turn[met] = line.take(met).at(back).turn

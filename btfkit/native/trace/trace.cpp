@@ -150,13 +150,13 @@ inline Vec lifted(Vec v) {
 }
 
 // From a point along d until it hits, or leaves.
-inline Bent sent(const Relief& r, const Patch& p, Point at, Vec d) {
-  if (p.k != 0) return march_bent(r, p, at, d);
+inline CurvedHit intersect(const Relief& r, const Patch& p, Point at, Vec d) {
+  if (p.k != 0) return march_curved(r, p, at, d);
   // Nothing is met after this: below the lowest point, or above the highest; one more for rounding.
   float last = d.z < 0 ? (at.z - r.lowest) / -d.z : (d.z > 0 ? (r.highest - at.z) / d.z : kFar);
   Hit hit = march(r, {at, d.x, -d.y, d.z}, std::min(std::max(last, 0.0f), kFar) + 1);
   // Rounding may let a ray end below all heights: it has hit the last cell it was in.
-  if (!hit.found && d.z < 0) hit = {true, {hit.at.i, hit.at.j, hit.at.a, hit.at.b, r.lowest}, hit.t};
+  if (!hit.met && d.z < 0) hit = {true, {hit.at.i, hit.at.j, hit.at.a, hit.at.b, r.lowest}, hit.t};
   return {hit, {}};
 }
 
@@ -165,11 +165,11 @@ inline Point above(Point at, Vec normal) {
 }
 
 // The view ray: through the place on z = 0, from where it comes into the layer of the relief.
-inline Bent looked(const Relief& r, const Patch& p, float col, float row, Vec v) {
+inline CurvedHit first_hit(const Relief& r, const Patch& p, float col, float row, Vec v) {
   float up = r.highest + kLift;
   if (p.k == 0) {
     float slope = up / v.z;
-    return sent(r, p, point(col + v.x * slope, row - v.y * slope, up), scaled(v, -1));
+    return intersect(r, p, point(col + v.x * slope, row - v.y * slope, up), scaled(v, -1));
   }
   // |centre + t v| = 1/k + up; where a concave patch has no such t, the ray begins half-way across.
   float c = up * (2 + p.k * up), square = v.z * v.z + p.k * c;
@@ -178,13 +178,13 @@ inline Bent looked(const Relief& r, const Patch& p, float col, float row, Vec v)
   Line::At start = line.at(square < 0 ? -v.z / p.k : c / (v.z + std::sqrt(square)));
   float da = start.s * p.ex - start.a * p.ey, db = -(start.s * p.ey + start.a * p.ex);
   Point from = moved(point(col, row, 0), da, db, start.dz);
-  Bent found = march_bent(r, p, from, p.turned(scaled(v, -1), start.turn));
-  Turn a = start.turn, b = found.turn;
-  return {found.hit, {a.cosine * b.cosine - a.sine * b.sine, a.sine * b.cosine + a.cosine * b.sine}};
+  CurvedHit inside = march_curved(r, p, from, p.turned(scaled(v, -1), start.turn));
+  Turn a = start.turn, b = inside.turn;
+  return {inside.hit, {a.cosine * b.cosine - a.sine * b.sine, a.sine * b.cosine + a.cosine * b.sine}};
 }
 
 // One ray of a query, followed to the relief: its offset in the footprint, and what it met.
-struct Look { uint32_t query, index; float dc, dr; Patch patch; Bent seen; };
+struct Look { uint32_t query, index; float dc, dr; Patch patch; CurvedHit seen; };
 
 // pi x radiance that reaches a ray from its hit, added to rgb; whether the light reaches the hit.
 template <int C>
@@ -203,7 +203,7 @@ inline bool lit(const Relief& r, const Look& ray, Surface<C>& s, Vec light, Vec 
   for (int bounce = 0;; ++bounce) {
     if (dot(s.normal, light) > 0) {
       Vec towards = p.k == 0 ? lifted(light) : light;
-      if (!sent(r, p, above(at, s.normal), towards).hit.found) {
+      if (!intersect(r, p, above(at, s.normal), towards).hit.met) {
         visible |= bounce == 0;
         shade(s, c, light, outgoing, throughput, rgb);
       }
@@ -221,8 +221,8 @@ inline bool lit(const Relief& r, const Look& ray, Surface<C>& s, Vec light, Vec 
     shade(s, c, next, outgoing, throughput, gain);
     float nl = std::max(dot(s.normal, next), 1e-6f);
     for (int n = 0; n < c; ++n) throughput[n] = gain[n] / nl;
-    Bent onward = sent(r, p, above(at, s.normal), next);
-    if (!onward.hit.found) return visible;
+    CurvedHit onward = intersect(r, p, above(at, s.normal), next);
+    if (!onward.hit.met) return visible;
     at = onward.hit.at;
     surface_at(r, p, at, true, s);
     light = p.turned(light, onward.turn);
@@ -257,14 +257,14 @@ inline Look look(const Relief& r, const Queries& in, size_t q, int i, int sample
     dr = radius * std::sin(angle);
   }
   const Patch p = patch(in.curvature[q], view);
-  return {query, index, dc, dr, p, looked(r, p, place[0] + dc, place[1] + dr, lifted(vec(view)))};
+  return {query, index, dc, dr, p, first_hit(r, p, place[0] + dc, place[1] + dr, lifted(vec(view)))};
 }
 
 // The maps are far larger than the near caches, and where a ray ends is known late: ask for them as
 // soon as it is, and use them after other rays have been followed. (Always inline: GCC takes a
 // function that does nothing else for one without effect, and drops the call.)
 [[gnu::always_inline]] inline void fetch(const Relief& r, const Hit& hit) {
-  if (!hit.found) return;
+  if (!hit.met) return;
   for (int down = 0; down < 2; ++down) {
     int i = wrapped(hit.at.i, r.w, r.wrap), j = wrapped(hit.at.j + down, r.h, r.wrap);
     const float* texel = r.maps + (static_cast<size_t>(j) * r.w + i) * r.k;
@@ -277,7 +277,7 @@ inline Look look(const Relief& r, const Queries& in, size_t q, int i, int sample
 template <int C>
 inline void add(const Relief& r, const Queries& in, const Answers& out, const Look& ray, int bounces,
                 uint32_t seed) {
-  if (!ray.seen.hit.found) return;
+  if (!ray.seen.hit.met) return;
   const size_t q = ray.query;
   const int c = channels<C>(r);
   const Point at = ray.seen.hit.at;
