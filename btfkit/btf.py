@@ -19,6 +19,7 @@ Wrap = Literal["wrap", "clamp"]
 RGB = ("R", "G", "B")
 QUANTITY = "pi * radiance / normal irradiance (cosine of the light included)"
 COLOUR = "linear BT.709, D65"
+_OF_PAIRS = ("light", "view", "light_position", "view_position", "validity", "footprint")
 
 
 @final
@@ -212,9 +213,22 @@ class BTF:
 
     def to_xarray(self) -> xarray.Dataset:
         """The same data as a lazy xarray.Dataset: texture, light, view and the optional arrays."""
-        from btfkit.labelled import to_xarray
+        from btfkit.labelled import dataset
 
-        return to_xarray(self)
+        attributes: dict[str, Any] = {
+            "colour": self.colour,
+            "wrap": self.wrap,
+            "history": list(self.history),
+        }
+        if self.texel_mm is not None:
+            attributes["texel_mm"] = self.texel_mm
+        return dataset(
+            self.textures,
+            {name: getattr(self, name) for name in _OF_PAIRS},
+            channels=self.channels,
+            quantity=QUANTITY,
+            attributes=attributes,
+        )
 
     def _known_texel_mm(self) -> float:
         if self.texel_mm is None:

@@ -1,7 +1,8 @@
-"""A BTF with named axes, for xarray's tools: lazily, one pair at a time."""
+"""Textures with named axes, for xarray's tools: lazily, one pair at a time."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
-from btfkit.btf import BTF, QUANTITY
 from btfkit.textures import Textures
 
 
@@ -40,33 +40,41 @@ class _LazyTextures(BackendArray):
         return np.empty((0, *np.empty(self.shape[1:], bool)[within].shape), np.float32)
 
 
-def to_xarray(btf: BTF) -> xarray.Dataset:
-    """`btf` as a Dataset with dimensions pair, row, column, channel.
+def dataset(
+    textures: Textures,
+    arrays: Mapping[str, NDArray[Any] | None],
+    *,
+    channels: Sequence[str],
+    quantity: str,
+    attributes: Mapping[str, Any],
+) -> xarray.Dataset:
+    """Textures and what belongs to their pairs, with dimensions pair, row, column, channel.
+
+    Args:
+        textures: (n, h, w, c), read one pair at a time.
+        arrays: light and view (n, 3), and what else of `BTF`'s arrays there is; None is left out.
+        channels: one name a channel.
+        quantity: of the textures.
+        attributes: of the whole.
 
     Returns:
         texture (pair, row, column, channel), light and view (pair, xyz), and
-        light_position, view_position, validity, footprint where the BTF has them.
+        light_position, view_position, validity, footprint where they are given.
     """
     image = ("pair", "row", "column", "channel")
-    lazy = indexing.LazilyIndexedArray(_LazyTextures(btf.textures))
-    data: dict[str, Any] = {
-        "texture": xarray.Variable(image, lazy, {"quantity": QUANTITY}),
-        "light": (("pair", "xyz"), btf.light),
-        "view": (("pair", "xyz"), btf.view),
+    lazy = indexing.LazilyIndexedArray(_LazyTextures(textures))
+    data: dict[str, Any] = {"texture": xarray.Variable(image, lazy, {"quantity": quantity})}
+    known = {
+        "light": (("pair", "xyz"), {}),
+        "view": (("pair", "xyz"), {}),
+        "light_position": (("pair", "xyz"), {"units": "mm"}),
+        "view_position": (("pair", "xyz"), {"units": "mm"}),
+        "validity": (image[:3], {}),
+        "footprint": (("pair",), {"units": "texel"}),
     }
-    for name in ("light_position", "view_position"):
-        if (position := getattr(btf, name)) is not None:
-            data[name] = (("pair", "xyz"), position, {"units": "mm"})
-    if btf.validity is not None:
-        data["validity"] = (image[:3], np.broadcast_to(btf.validity, btf.shape[:3]))
-    if btf.footprint is not None:
-        data["footprint"] = (("pair",), btf.footprint, {"units": "texel"})
-    coords = {"channel": list(btf.channels), "xyz": ["x", "y", "z"]}
-    attributes: dict[str, Any] = {
-        "colour": btf.colour,
-        "wrap": btf.wrap,
-        "history": list(btf.history),
-    }
-    if btf.texel_mm is not None:
-        attributes["texel_mm"] = btf.texel_mm
-    return xarray.Dataset(data, coords=coords, attrs=attributes)
+    for name, (axes, units) in known.items():
+        if (value := arrays.get(name)) is not None:
+            shape = textures.shape[:3] if name == "validity" else value.shape
+            data[name] = (axes, np.broadcast_to(value, shape), units)
+    coords = {"channel": list(channels), "xyz": ["x", "y", "z"]}
+    return xarray.Dataset(data, coords=coords, attrs=dict(attributes))

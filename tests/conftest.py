@@ -1,4 +1,4 @@
-"""What every test file shares: tolerances with reasons, strategies, real data."""
+"""What every test file shares: threads a worker, hypothesis without deadlines, real data."""
 
 from __future__ import annotations
 

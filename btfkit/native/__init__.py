@@ -1,8 +1,9 @@
 """C++ kernels behind Python faces, each with the plain numpy twin it is tested against.
 
-A kernel is one folder `name`: `name.cpp` and its headers, built as `btfkit.native.name._name`,
-and `__init__.py`, its face: the same function twice, `..._plain` in numpy and, where the
-extension was built, the compiled one. `BTFKIT_PLAIN=1` chooses the twins.
+A kernel is one folder `name`: `name.cpp` and its headers, built as `btfkit.native.name._name`;
+`__init__.py`, its face; and its twin, functions named `..._plain` in the face or, where they are
+long, in modules beside it. Where the extension was not built, or `BTFKIT_PLAIN=1` asks for it, the
+twin answers.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting import loop, pca
-from btfkit.fitting.factorisation import Rows, factorised
+from btfkit.fitting.factorisation import EncodedRows, factorised
 from btfkit.fitting.fit import fit, split
 from btfkit.fitting.lambert import lambert
 from btfkit.fitting.rainer import trainable as rainer
@@ -431,7 +431,7 @@ def matrix(btf: BTF, *, floor: float = 1.0) -> np.ndarray:
 def test_factors_are_those_of_the_singular_value_decomposition(memory: int) -> None:
     a = matrix(in_memory())
     singular = np.linalg.svd(a, compute_uv=False)
-    rows = Rows(in_memory(), "log", 1.0, memory=memory)
+    rows = EncodedRows(in_memory(), "log", 1.0, memory=memory)
     factors = factorised(rows, (0, 1, 2), 12, passes=4)
     residual = np.sqrt(np.square(a - factors.left @ factors.right.T).mean())
     best = math.sqrt(np.square(singular[12:]).sum() / a.size)
