@@ -25,7 +25,7 @@ check: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/btfkit bench
 
-$(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(KERNELS)
+$(STAMP): pyproject.toml constraints.txt CMakeLists.txt btfkit/conventions.py $(KERNELS)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "btfkit needs Python 3.11 or later; name one: make PYTHON=python3.11 $(MAKECMDGOALS)"; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || \

@@ -117,13 +117,17 @@ def _rows(part: NDArray[Any], shape: tuple[int, ...], last: tuple[int, ...]) -> 
 
 
 def share_lights(
-    uv: ArrayLike, light: ArrayLike, view: ArrayLike, footprint: ArrayLike = 0.5
+    uv: ArrayLike,
+    light: ArrayLike,
+    view: ArrayLike,
+    footprint: ArrayLike = 0.5,
+    curvature: ArrayLike = 0.0,
 ) -> bool:
     """Whether several lights (m, 1, ..., 3) meet several views that have no axis of theirs."""
     lights = np.shape(light)[:-1]
     if len(lights) < 2 or lights[0] < 2 or math.prod(lights[1:]) != 1:
         return False
-    views = [np.shape(uv)[:-1], np.shape(view)[:-1], np.shape(footprint)]
+    views = [np.shape(uv)[:-1], np.shape(view)[:-1], np.shape(footprint), np.shape(curvature)]
     own = [len(shape) < len(lights) or (len(shape) == len(lights) and shape[0] == 1)
            for shape in views]  # fmt: skip
     return all(own) and max(math.prod(shape) for shape in views) > 1

@@ -23,7 +23,8 @@ from btfkit.materials.base import Header
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.native.neural import Kernel, variants
-from btfkit.native.neural.layout import Activation, Array, Layout
+from btfkit.native.neural.layout import Array, Layout
+from btfkit.program import Activation
 from btfkit.textures import as_textures
 
 _SECONDS = 0.5

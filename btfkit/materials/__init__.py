@@ -15,6 +15,15 @@ MODELS: dict[str, str] = {
     "neumip": "btfkit.materials.neumip.material:NeuMIP",
     "neumip-paper": "btfkit.materials.neumip.material:NeuMIPPaper",
 }
+# Models whose `program()` gives their evaluation as data.
+PROGRAMS: tuple[str, ...] = (
+    "lambert",
+    "rainer19",
+    "rainer20",
+    "neubtf",
+    "neumip",
+    "neumip-paper",
+)
 
 
 def material_class(model: str) -> Any:

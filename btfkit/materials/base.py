@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from btfkit import queries
 from btfkit.btf import BTF, QUANTITY, RGB, Wrap
-from btfkit.native.prepare import Prepared, prepare
+from btfkit.native.prepare import Prepared, prepare, prepare_lights
+from btfkit.program import Program
 from btfkit.queries import Query, Response
 
 Array = NDArray[np.float32]
@@ -120,16 +121,29 @@ class Material(ABC):
         footprint or curvature holds for all, its stride is 0.
         """
 
-    def _answer_lights(
-        self, uv: ArrayLike, light: ArrayLike, view: ArrayLike, footprint: ArrayLike
-    ) -> Array | None:
-        """Reflectance (m, ..., c) where views of (...) share m lights of (m, 1, ..., 3).
+    def _keeps_views(self) -> bool:
+        """Whether `_answer_lights` saves anything over asking query by query."""
+        return False
 
-        What a model that keeps what does not depend on the light answers faster than query by
-        query; None where it does not, or where the queries have to be looked at one by one.
+    def _answer_lights(self, query: Query) -> tuple[Array, Array | None]:
+        """Reflectance (m, b, c) and opacity (b,) of b views under m lights that they share.
+
+        As `_answer`, but `query.light` is (m, 3). Called where `_keeps_views`.
         """
-        del uv, light, view, footprint
-        return None
+        raise NotImplementedError
+
+    def program(self) -> Program:
+        """The evaluation as data: what exporters and other evaluators read.
+
+        Raises:
+            TypeError: the answers are blended from measurements; there is no program of that.
+        """
+        from btfkit.materials import PROGRAMS
+
+        raise TypeError(
+            f"{self.model} blends measured pairs and has no program; "
+            f"models that have one: {', '.join(PROGRAMS)}"
+        )
 
     @final
     def evaluate(
@@ -156,10 +170,8 @@ class Material(ABC):
         Raises:
             ValueError: wrong last axes, or shapes that do not broadcast.
         """
-        if queries.share_lights(uv, light, view, footprint) and not np.any(curvature):
-            rgb = self._answer_lights(uv, light, view, footprint)
-            if rgb is not None:
-                return Response(rgb, np.ones(rgb.shape[:-1], np.float32))
+        if self._keeps_views() and queries.share_lights(uv, light, view, footprint, curvature):
+            return self._under_shared_lights(uv, light, view, footprint, curvature)
         query, shape = queries.flatten(uv, light, view, footprint, curvature)
         b, c = math.prod(shape), len(self.header.channels)
         rgb, opacity = np.empty((b, c), np.float32), np.empty(b, np.float32)
@@ -168,31 +180,71 @@ class Material(ABC):
             some = slice(start, start + _BLOCK)
             block = Query(*(part if len(part) == 1 else part[some] for part in query))
             masked += self._answer_block(block, rgb[some], opacity[some])
-        if masked:
-            warnings.warn(
-                f"{masked} of {b} queries are not finite or seen from below the "
-                "horizon; they answer 0 with opacity 0",
-                stacklevel=2,
-            )
+        _warn_of_masked(masked, b)
+        return Response(rgb.reshape(*shape, c), opacity.reshape(shape))
+
+    def _under_shared_lights(
+        self,
+        uv: ArrayLike,
+        light: ArrayLike,
+        view: ArrayLike,
+        footprint: ArrayLike,
+        curvature: ArrayLike,
+    ) -> Response:
+        """`evaluate` of views (...) under lights (m, 1, ..., 3): the views are prepared once."""
+        every = np.asarray(light, np.float32)
+        shape = np.broadcast_shapes(
+            every.shape[:-1],
+            *(np.shape(part)[:-1] for part in (uv, view)),
+            *(np.shape(part) for part in (footprint, curvature)),
+        )
+        if every.shape[-1] != 3:
+            raise ValueError(f"light has shape {every.shape}; expected (..., 3)")
+        up = np.asarray([0, 0, 1], np.float32)
+        query, own = queries.flatten(uv, up, view, footprint, curvature)
+        lights = prepare_lights(every.reshape(-1, every.shape[-1]), below=self.full_sphere)
+        m, b, c = len(lights.good), math.prod(own), len(self.header.channels)
+        rgb = np.zeros((m, b, c), np.float32)
+        opacity = np.empty((m, b), np.float32)
+        seen = np.empty(b, np.float32)
+        size = max(_BLOCK // m, 1)
+        for start in range(0, b, size):
+            some = slice(start, start + size)
+            block = Query(*(part if len(part) == 1 else part[some] for part in query))
+            ready = self._ready(block, seen[some], below=True)
+            rows = slice(None) if ready.rows is None else ready.rows
+            cover = seen[some].copy()
+            if len(ready.uv) and len(lights.rows):
+                asked = _spread(ready)._replace(light=lights.light)
+                values, found = self._answer_lights(asked)
+                if found is not None:
+                    cover[rows] = found
+                    values = np.where(found[:, None] > 0, values, 0.0)
+                at = np.arange(b)[some][rows]
+                rgb[lights.rows[:, None], at] = values
+            opacity[:, some] = lights.good[:, None] * cover
+        _warn_of_masked(m * b - int(lights.good.sum()) * int(np.count_nonzero(seen)), m * b)
         return Response(rgb.reshape(*shape, c), opacity.reshape(shape))
 
     def _answer_block(self, query: Query, rgb: Array, opacity: Array) -> int:
         """Answer one block into `rgb` and `opacity`; returns how many are masked."""
-        ready = prepare(*query, opacity, wrap=self.header.wrap == "wrap", below=self.full_sphere)
-        self._warn_of_missing_parts(ready)
-        m = len(ready.uv)
+        ready = self._ready(query, opacity, below=self.full_sphere)
         if ready.rows is not None:
             rgb[:] = 0
-        if not m:
+        if not len(ready.uv):
             return ready.masked
-        blur, bend = (np.broadcast_to(part, m) for part in (ready.footprint, ready.curvature))
-        values, cover = self._answer(Query(ready.uv, ready.light, ready.view, blur, bend))
+        values, cover = self._answer(_spread(ready))
         rows = slice(None) if ready.rows is None else ready.rows
         if cover is not None:
             opacity[rows] = cover
             values = np.where(cover[:, None] > 0, values, 0.0)
         rgb[rows] = values
         return ready.masked
+
+    def _ready(self, query: Query, opacity: Array, *, below: bool) -> Prepared:
+        ready = prepare(*query, opacity, wrap=self.header.wrap == "wrap", below=below)
+        self._warn_of_missing_parts(ready)
+        return ready
 
     def _warn_of_missing_parts(self, ready: Prepared) -> None:
         for part, has, asked in (
@@ -203,3 +255,19 @@ class Material(ABC):
                 self._warned.add(part)
                 what = "at its finest level" if part == "footprint" else "on the plane"
                 warnings.warn(f"{self.model} knows no {part}: it answers {what}", stacklevel=4)
+
+
+def _spread(ready: Prepared) -> Query:
+    """Prepared queries, one row each in every part."""
+    m = len(ready.uv)
+    blur, bend = (np.broadcast_to(part, m) for part in (ready.footprint, ready.curvature))
+    return Query(ready.uv, ready.light, ready.view, blur, bend)
+
+
+def _warn_of_masked(masked: int, count: int) -> None:
+    if masked:
+        warnings.warn(
+            f"{masked} of {count} queries are not finite or seen from below the "
+            "horizon; they answer 0 with opacity 0",
+            stacklevel=3,
+        )

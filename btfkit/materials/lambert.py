@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from btfkit.materials.base import Array, Header, Material
 from btfkit.materials.bilinear import lookup
+from btfkit.program import Head, Program, Texture
 from btfkit.queries import Query
 
 
@@ -42,3 +43,18 @@ class Lambert(Material):
 
     def _answer(self, query: Query) -> tuple[Array, Array | None]:
         return lookup(self._albedo, query.uv, self.header.wrap) * query.light[:, 2:], None
+
+    def program(self) -> Program:
+        albedo = Texture("albedo", (self._albedo,))
+        return Program(
+            channels=self.header.channels,
+            grid=self.header.grid,
+            aspect=self.header.aspect,
+            wrap=self.header.wrap == "wrap",
+            textures=(albedo,),
+            inputs=albedo.features,
+            layers=(),
+            heads=(Head("linear", self.spec.channels),),
+            output="cosine",
+            leveled=False,
+        )

@@ -13,13 +13,13 @@ from typing import ClassVar, final
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.conventions import EPSILON, LOWEST_COSINE, MOST_LOG, displacement
 from btfkit.materials.base import Array, Header, Material
+from btfkit.native.neural.plain import on_disc
+from btfkit.program import Dense, DepthNetwork, Head, Program, Texture
 from btfkit.queries import Query
 
 LATENTS, WIDTH, HIDDEN = 14, 32, 3
-# A phase that large has no direction left in float32, an exponent that large no value.
-_MOST_LOG = 20.0
-_EPSILON = 1e-5
 # Samples rendered at once: 32 channels of them stay in a core's second-level cache.
 _BLOCK = 1 << 13
 
@@ -59,18 +59,6 @@ def renderer_shapes(spec: NeuBTFSpec) -> dict[str, tuple[int, ...]]:
     shapes["renderer.out.weight"] = (spec.channels, spec.width)
     shapes["renderer.out.bias"] = (spec.channels,)
     return shapes
-
-
-def on_disc(direction: Array) -> Array:
-    """(..., 2) directions (..., 3) on the unit disc: azimuth kept, radius 2/pi x polar angle.
-
-    In x and y alone the cosine has an infinite slope at the horizon; in the angle it is smooth.
-    """
-    tangential = np.hypot(direction[..., 0], direction[..., 1])
-    angle = np.arctan2(tangential, direction[..., 2])
-    # At the pole angle / sine is 1.
-    stretch = np.where(tangential > 1e-6, angle / np.maximum(tangential, 1e-6), 1)
-    return direction[..., :2] * (stretch * (2 / np.pi)).astype(np.float32)[..., None]
 
 
 def parallax_shapes(spec: NeuBTFSpec) -> dict[str, tuple[int, ...]]:
@@ -128,7 +116,7 @@ class NeuBTF(Material):
             z = self._normalised(layer, self._linear(f"renderer.{layer}", x))
             activation = np.sin(np.float32(self.spec.omega) * z)
             x = activation if layer == 0 else x + activation
-        logs = np.minimum(self._linear("renderer.out", x), np.float32(_MOST_LOG))
+        logs = np.minimum(self._linear("renderer.out", x), np.float32(MOST_LOG))
         return np.maximum(np.expm1(logs), np.float32(0))
 
     def _shifted(self, uv: Array, view: Array) -> Array:
@@ -136,19 +124,65 @@ class NeuBTF(Material):
         inputs = np.concatenate([self._lookup(uv), view[:, :2]], axis=1)
         hidden = np.maximum(self._linear("parallax.0", inputs), 0)
         height = self._linear("parallax.1", hidden)
-        step = height * view[:, :2] / np.maximum(view[:, 2:], np.float32(0.6))
-        axes = np.array([1, -self.header.aspect], np.float32)
-        moved = (uv + step * axes).astype(np.float32, copy=False)
+        cosine = np.maximum(view[:, 2], np.float32(LOWEST_COSINE))
+        du, dv = displacement(
+            height[:, 0] * view[:, 0], height[:, 0] * view[:, 1], cosine, self.header.aspect
+        )
+        moved = (uv + np.stack([du, dv], axis=1)).astype(np.float32, copy=False)
         if self.header.wrap == "wrap":
             return moved - np.floor(moved)
         return np.clip(moved, 0, 1)
+
+    def program(self) -> Program:
+        texture = self._layered("renderer", HIDDEN)
+        codes = Texture("latents", (self._texture.reshape(*self.spec.size, -1),), view=1.0)
+        depth = None
+        if self.spec.parallax:
+            flat = Texture("depth", codes.levels)
+            first, last = (
+                (self._layers[f"parallax.{k}.weight"].T, self._layers[f"parallax.{k}.bias"])
+                for k in range(2)
+            )
+            layers = (Dense(*first, "relu"), Dense(*last, "linear"))
+            depth = DepthNetwork(flat, (*flat.features, "vx", "vy"), layers, 1.0)
+        return Program(
+            channels=self.header.channels,
+            grid=self.header.grid,
+            aspect=self.header.aspect,
+            wrap=self.header.wrap == "wrap",
+            textures=(codes,),
+            inputs=(*codes.features, "lx_disc", "ly_disc", "vx_disc", "vy_disc"),
+            layers=texture,
+            heads=(Head("log", self.spec.channels),),
+            output="log",
+            leveled=False,
+            depth=depth,
+        )
+
+    def _layered(self, name: str, hidden: int) -> tuple[Dense, ...]:
+        found = []
+        for k in range(hidden):
+            parts = [self._layers[f"{name}.{k}.{part}"] for part in ("weight", "bias")]
+            found.append(
+                Dense(
+                    parts[0].T,
+                    parts[1],
+                    "sine",
+                    omega=self.spec.omega,
+                    gain=self._layers[f"{name}.{k}.norm.weight"],
+                    centre=self._layers[f"{name}.{k}.norm.bias"],
+                    residual=k > 0,
+                )
+            )
+        last = (self._layers[f"{name}.out.weight"].T, self._layers[f"{name}.out.bias"])
+        return (*found, Dense(*last, "linear"))
 
     def _linear(self, name: str, x: Array) -> Array:
         return x @ self._layers[f"{name}.weight"] + self._layers[f"{name}.bias"]
 
     def _normalised(self, layer: int, z: Array) -> Array:
         z = z - z.mean(axis=1, keepdims=True)
-        z /= np.sqrt(np.square(z).mean(axis=1, keepdims=True) + np.float32(_EPSILON))
+        z /= np.sqrt(np.square(z).mean(axis=1, keepdims=True) + np.float32(EPSILON))
         name = f"renderer.{layer}.norm"
         return z * self._layers[f"{name}.weight"] + self._layers[f"{name}.bias"]
 

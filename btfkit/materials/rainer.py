@@ -15,13 +15,13 @@ from typing import Any, ClassVar, final
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.conventions import LEAK, MOST_LOG
 from btfkit.materials.base import Array, Header, Material
 from btfkit.materials.bilinear import lookup
+from btfkit.program import Dense, Head, Program, Texture
 from btfkit.queries import Query
 
 WIDTH, HIDDEN = 106, 4
-SLOPE = 0.01
-_MOST_LOG = 20.0
 # Samples decoded at once: their hidden layers stay in a core's second-level cache.
 _BLOCK = 1 << 11
 
@@ -98,12 +98,32 @@ class _Rainer(Material):
             x = x @ weight
             x += bias
             if layer < HIDDEN:
-                x = np.maximum(x, np.float32(SLOPE) * x)
+                x = np.maximum(x, np.float32(LEAK) * x)
         if self._whitening is not None:
             white = lookup(self._whitening, query.uv, wrap)
             c = self.spec.channels
             x = white[:, :c] + white[:, c:] * x
-        return np.maximum(np.expm1(np.minimum(x, np.float32(_MOST_LOG))), np.float32(0))
+        return np.maximum(np.expm1(np.minimum(x, np.float32(MOST_LOG))), np.float32(0))
+
+    def program(self) -> Program:
+        codes, white = Texture("codes", (self._codes,)), self._whitening
+        kinds = ("leaky",) * HIDDEN + ("linear",)
+        return Program(
+            channels=self.header.channels,
+            grid=self.header.grid,
+            aspect=self.header.aspect,
+            wrap=self.header.wrap == "wrap",
+            textures=(codes,),
+            inputs=(*codes.features, "lx", "ly", "vx", "vy"),
+            layers=tuple(
+                Dense(weight.T, bias, kind)  # type: ignore[arg-type]
+                for (weight, bias), kind in zip(self._layers, kinds, strict=True)
+            ),
+            heads=(Head("log", self.spec.channels),),
+            output="log",
+            leveled=False,
+            scaling=None if white is None else Texture("scaling", (white,)),
+        )
 
 
 @final

@@ -26,7 +26,8 @@ from btfkit.fitting.neubtf import trainable as neubtf
 from btfkit.fitting.neubtf.siren import Renderer
 from btfkit.fitting.neubtf.unet import STRIDE, Encoder
 from btfkit.io import images
-from btfkit.materials.neubtf import NeuBTFSpec, on_disc, renderer_shapes
+from btfkit.materials.neubtf import NeuBTFSpec, renderer_shapes
+from btfkit.native.neural.plain import on_disc
 from btfkit.relief.synth import synth_btf
 
 TINY: dict[str, str] = {"texels": "64", "pairs": "4"}

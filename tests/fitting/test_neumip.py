@@ -102,8 +102,7 @@ def test_with_and_without_the_kernel_the_answers_agree(output, monkeypatch):
     np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5)
     lights = upper(rng, 4)
     lights[0, 2] *= -1
-    many = (ask[0], ask[2], lights, ask[3])
-    both = [m.evaluate_lights(*many) for m in (fast, plain)]
+    both = [m.evaluate(ask[0], lights[:, None], ask[2], ask[3]).reflectance for m in (fast, plain)]
     np.testing.assert_allclose(*both, rtol=2e-4, atol=2e-5)
     assert not both[0][0].any()
     for light, answer in zip(lights, both[0], strict=True):
@@ -220,21 +219,36 @@ def test_group_29_no_queries_strided_and_float64_inputs():
     assert found.evaluate(
         np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3))
     ).reflectance.shape == (0, 3)
-    assert found.evaluate_lights(np.zeros((0, 2)), np.zeros((0, 3)), upper(rng, 2)).shape == (
-        2,
-        0,
-        3,
-    )
+    none = found.evaluate(np.zeros((0, 2)), upper(rng, 2)[:, None], np.zeros((0, 3)))
+    assert none.reflectance.shape == (2, 0, 3)
     uv, light, view = rng.random((600, 2)), upper(rng, 600), upper(rng, 600)
     whole = found.evaluate(uv, light, view).reflectance
     np.testing.assert_array_equal(
         found.evaluate(uv[::3], light.astype(float)[::3], np.asfortranarray(view)[::3]).reflectance,
         whole[::3],
     )
-    with pytest.raises(ValueError, match="expected as many"):
-        found.evaluate_lights(uv, view[:5], light)
-    with pytest.raises(ValueError, match="must be finite"):
-        found.evaluate_lights(uv, view, np.full((1, 3), np.nan))
+    with pytest.raises(ValueError, match="do not broadcast|could not be broadcast|broadcast"):
+        found.evaluate(uv, light[:, None], view[:5])
+
+
+def test_lights_that_views_share_are_masked_and_counted_as_queries_of_their_own_would_be():
+    rng = np.random.default_rng(5)
+    found = material()
+    uv, view, lights = rng.random((40, 2)), upper(rng, 40), upper(rng, 6)
+    lights[1], lights[2], lights[3, 2] = np.nan, 0, -0.5
+    view[3], view[5, 2] = np.inf, -0.2
+    with pytest.warns(UserWarning, match=r"88 of 240 queries"):
+        shared = found.evaluate(uv, lights[:, None], view)
+    rgb, opacity = [], []
+    for light in lights:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            alone = found.evaluate(uv, light, view)
+        rgb.append(alone.reflectance)
+        opacity.append(alone.opacity)
+    # One stage of the view for all lights: sums in another order.
+    np.testing.assert_allclose(shared.reflectance, np.stack(rgb), rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(shared.opacity, np.stack(opacity))
 
 
 def test_a_texture_smaller_than_the_grid_begins_at_its_own_level():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import warnings
@@ -19,8 +20,10 @@ from btfkit import materials
 from btfkit.btf import BTF
 from btfkit.fitting import CLOSED_FORM, MODELS
 from btfkit.fitting.fit import fit
-from btfkit.materials.base import Material
+from btfkit.materials.base import Header, Material
 from btfkit.materials.evaluation import answer_pair
+from btfkit.materials.neubtf import NeuBTF, NeuBTFSpec
+from btfkit.native.neural import plain
 from btfkit.relief.synth import synth_btf
 
 # Steps and settings with which a model is fitted in about a second.
@@ -342,3 +345,45 @@ def test_no_model_needs_torch_to_answer(tmp_path: Path) -> None:
         [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=False
     )
     assert run.stdout.splitlines() == ["(3,)"] * len(MODELS), run.stderr
+
+
+@pytest.mark.parametrize("model", materials.PROGRAMS)
+def test_the_program_of_a_model_answers_as_the_model_does(model: str) -> None:
+    material = fitted(model)
+    program, rng = material.program(), np.random.default_rng(7)
+    uv = rng.random((500, 2), np.float32)
+    light, view = (upper(rng, 500).astype(np.float32) for _ in range(2))
+    footprint = rng.uniform(0, 4, 500).astype(np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        wanted = material.evaluate(uv, light, view, footprint)
+    rgb, opacity = plain.answer(program, uv, light, view, footprint)
+    # float32 through the layers in another order, magnified by exp.
+    np.testing.assert_allclose(rgb, wanted.reflectance, rtol=3e-4, atol=3e-5)
+    np.testing.assert_allclose(opacity, wanted.opacity, atol=1e-6)
+    assert program.channels == material.header.channels
+    assert program.grid == material.header.grid
+    json.dumps(program.described())
+
+
+@pytest.mark.parametrize("model", sorted(set(materials.MODELS) - set(materials.PROGRAMS)))
+def test_a_measured_model_names_those_that_have_a_program(model: str) -> None:
+    with pytest.raises(TypeError, match=rf"{model} blends measured pairs .* lambert, rainer19"):
+        fitted(model).program()
+
+
+def test_the_program_of_a_neubtf_with_parallax_moves_its_lookup_as_the_model_does() -> None:
+    rng = np.random.default_rng(8)
+    spec = NeuBTFSpec((6, 10), parallax=True)
+    header = Header(grid=(6, 10), wrap="clamp")
+    weights = {
+        name: rng.normal(0, 0.4, shape).astype(np.float32)
+        for name, shape in NeuBTF.shapes(spec, header).items()
+    }
+    material = NeuBTF(spec, weights, header)
+    uv = rng.random((300, 2), np.float32)
+    light, view = (upper(rng, 300).astype(np.float32) for _ in range(2))
+    rgb, _ = plain.answer(material.program(), uv, light, view)
+    wanted = material.evaluate(uv, light, view).reflectance
+    # As above; a place on the border between two texels moves with rounding.
+    np.testing.assert_allclose(rgb, wanted, rtol=2e-3, atol=2e-4)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from btfkit.conventions import FLATTEST
 from btfkit.fitting.adam import adam_plain
 from btfkit.fitting.neumip.engines import eager
 from btfkit.materials.base import Header
@@ -138,7 +139,9 @@ def apart_from_kinks(case, weights, texels, parts):
     if case.offset:
         check(uv, case.offset[0].sizes)
     for bank in case.banks:
-        move = bank.view * plain.step(view, case) - bank.light * plain.step(light, case)
+        move = bank.view * plain.step(view, case.aspect) - bank.light * plain.step(
+            light, case.aspect
+        )
         check(uv + depth[:, None] * move, bank.sizes)
     if footprint is not None:
         for bank in case.banks:
@@ -150,7 +153,7 @@ def apart_from_kinks(case, weights, texels, parts):
 
 def check_rays(case, texels, uv, view, depth, away):
     """Leaves out crossings at texel borders, and those about to be held back for grazing."""
-    along = plain.ray(view, case)
+    along = plain.ray(view, case.aspect, case.depth_scale)
     place = uv + (depth / plain.lift(view) / case.depth_scale)[:, None] * along
     h, w = case.heights
     x = place * [w, h] - 0.5
@@ -160,7 +163,7 @@ def check_rays(case, texels, uv, view, depth, away):
         plain.bilinear(surface, place + side * 1e-6 * along, wrap=case.wrap)[:, 0]
         for side in (1, -1)
     )
-    away[np.abs(1 - (ahead - behind) / 2e-6 - plain.FLATTEST) < 1e-2] = False
+    away[np.abs(1 - (ahead - behind) / 2e-6 - FLATTEST) < 1e-2] = False
 
 
 def relative(found, wanted):

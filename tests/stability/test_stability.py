@@ -90,7 +90,7 @@ def test_group_1_the_offset_stops_growing_at_53_degrees_and_its_gradient_is_fini
     case = material().layout
     elevation = np.array([1.0, 0.61, 0.6, 0.59, 0.1, 1e-6, 0.0], np.float32)
     view = np.stack([np.sqrt(1 - elevation**2), 0 * elevation, elevation], axis=1)
-    step = plain.step(view, case)
+    step = plain.step(view, case.aspect)
     assert np.isfinite(step).all()
     assert np.abs(step[:, 0]).max() == pytest.approx(1 / 0.6, rel=1e-6)
     for part in gradients(np.tile(UP, (7, 1)), view.astype(np.float32)):

@@ -13,7 +13,7 @@ from btfkit.materials.neubtf import HIDDEN, NeuBTFSpec
 
 
 def on_disc(direction: Tensor) -> Tensor:
-    """Twin of `materials.neubtf.on_disc`: directions (..., 3) to (..., 2)."""
+    """Twin of `native.neural.plain.on_disc`: directions (..., 3) to (..., 2)."""
     tangential = torch.hypot(direction[..., 0], direction[..., 1])
     angle = torch.atan2(tangential, direction[..., 2])
     stretch = torch.where(tangential > 1e-6, angle / tangential.clamp_min(1e-6), 1.0)

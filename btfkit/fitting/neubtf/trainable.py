@@ -30,6 +30,7 @@ from btfkit.fitting.neubtf.data import PairDirections, HeldOut, first_latents, f
 from btfkit.fitting.neubtf.settings import Settings
 from btfkit.fitting.pool import Pool
 from btfkit.settings import parsed
+from btfkit.conventions import LOWEST_COSINE
 from btfkit.fitting.neubtf.siren import ParallaxHead, Renderer, on_disc
 from btfkit.fitting.neubtf.unet import Encoder
 from btfkit.materials import neubtf as evaluated
@@ -309,7 +310,7 @@ class NeuBTF(Trainable):
         latents = texture[rows * size[1] + cols]
         if self.parallax is not None:
             step = self.parallax(latents.expand(len(index), *latents.shape), view[..., :2])
-            shift = step * view[..., :2] / view[..., 2:].clamp_min(0.6)
+            shift = step * view[..., :2] / view[..., 2:].clamp_min(LOWEST_COSINE)
             # z is in tile widths of the whole tile; texels of this texture per tile width:
             texels = w * (size[1] / (window.width if window is not None else w))
             row = rows - shift[..., 1] * texels

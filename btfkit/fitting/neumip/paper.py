@@ -23,6 +23,7 @@ from btfkit.fitting.neumip.start import initial_texels
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.base import Material
 from btfkit.materials.neumip.spec import NeuMIPSpec
+from btfkit.native.neural.plain import YUV_TO_RGB
 from btfkit.native.neural.layout import Array
 
 
@@ -88,7 +89,7 @@ class NeuMIPPaper(Recipe):
         if self.spec.output != "released":
             return torch_loss(self.layout, weights, texels, batch, "square")
         raw = eager.forward(self.layout, weights, texels, *tensors(batch))
-        mixed = torch.tensor(evaluated.YUV_TO_RGB, dtype=raw.dtype)
+        mixed = torch.tensor(YUV_TO_RGB, dtype=raw.dtype)
         rgb = torch.expm1((raw[:, :3] @ mixed.T).clamp(max=20))
         rgb = rgb * (0.1 + torch.sigmoid(raw[:, 3:]))
         target = torch.from_numpy(batch.target)

@@ -9,7 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from btfkit.materials.rainer import HIDDEN, SLOPE, RainerSpec
+from btfkit.conventions import LEAK
+from btfkit.materials.rainer import HIDDEN, RainerSpec
 
 
 @final
@@ -20,7 +21,7 @@ class Layers(nn.Module):
         super().__init__()
         layers = [nn.Linear(a, b) for a, b in pairwise(sizes)]
         for layer in layers:
-            nn.init.kaiming_uniform_(layer.weight, a=SLOPE, generator=generator)
+            nn.init.kaiming_uniform_(layer.weight, a=LEAK, generator=generator)
             nn.init.zeros_(layer.bias)
         self.layers = nn.ModuleList(layers)
 
@@ -29,7 +30,7 @@ class Layers(nn.Module):
         for index, layer in enumerate(self.layers):
             x = layer(x)
             if index + 1 < len(self.layers):
-                x = F.leaky_relu(x, SLOPE)
+                x = F.leaky_relu(x, LEAK)
         return x
 
 
@@ -99,6 +100,6 @@ class SetEncoder(nn.Module):
         x = torch.cat(parts, dim=-1)
         *hidden, last = self.sample.layers
         for layer in hidden:
-            x = F.leaky_relu(layer(x), SLOPE)
+            x = F.leaky_relu(layer(x), LEAK)
         # The last layer is linear: after the mean it has two thirds less of all to multiply.
         return self.join(last(x.mean(dim=1)))

@@ -7,7 +7,8 @@ from typing import Literal, final
 
 from btfkit.footprint import level_sizes, resolved_level
 from btfkit.materials.base import Header
-from btfkit.native.neural.layout import Activation, Layout, Network, Networks, Output, Pyramid
+from btfkit.native.neural.layout import Layout, Network, Networks, Output, Pyramid
+from btfkit.program import Activation
 
 Precision = Literal["float32", "float16", "int8"]
 # Levels that the coarse bank begins above the finest one.
@@ -65,14 +66,20 @@ class NeuMIPSpec:
     def layout(self, header: Header) -> Layout:
         """The model as its kernels see it."""
         shift = resolved_level(self.size, header.grid)
-        banks = [Pyramid(level_sizes(self.size, self.levels), self.features, shift=shift)]
+        banks = [
+            Pyramid(
+                level_sizes(self.size, self.levels), self.features, shift=shift, name="features"
+            )
+        ]
         if self.coarse:
             base = level_sizes(self.size, _COARSE + 1)[-1]
             levels = max(self.levels - _COARSE, 1)
             start = resolved_level(base, header.grid)
-            banks.append(Pyramid(level_sizes(base, levels), self.coarse, shift=start))
+            banks.append(
+                Pyramid(level_sizes(base, levels), self.coarse, shift=start, name="coarse")
+            )
         if self.light:
-            banks.append(Pyramid((self.size,), self.light, light=1.0, shift=shift))
+            banks.append(Pyramid((self.size,), self.light, light=1.0, shift=shift, name="light"))
         outputs = self.channels * (2 if self.output in ("mask", "released") else 1)
         inputs = sum(bank.channels for bank in banks) + 2 * self.frames + len(self.directions)
         decoder = Network((inputs, *self.hidden, outputs), self.directions, self.activation)

@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal, final
+from typing import Any, Literal, final
 
 import numpy as np
 
 from btfkit import native
-from btfkit.native.neural.layout import (
-    ACTIVATIONS,
-    CHANNELS,
-    DIRECTIONS,
-    OUTPUTS,
-    Array,
-    Layout,
-    Network,
-    Networks,
-)
+from btfkit.native.neural.layout import CHANNELS, Array, Layout, Network, Networks
 
 Loss = Literal["square", "absolute"]
 
@@ -46,33 +37,7 @@ class Kernel:
             raise RuntimeError("the NeuMIP kernel was not built; use evaluate_plain")
         self._threads = native.threads() if threads is None else threads
         self._variant = variant
-        textures: list[list[int]] = []
-        banks: list[list[float]] = []
-        at = layout.texels - sum(pyramid.texels for pyramid in layout.pyramids)
-        for pyramid in layout.pyramids:
-            first = len(textures)
-            for h, w in pyramid.sizes:
-                textures.append([h, w, at])
-                at += h * w
-            count = len(pyramid.sizes)
-            moves = (pyramid.view, pyramid.light, pyramid.shift)
-            banks.append([float(pyramid.channels), float(first), float(count), *moves])
-        offset = layout.offset[1] if layout.offset else Network((1, 1), ())
-        self._model = module.Model(
-            layout.wrap,
-            layout.aspect,
-            layout.depth_scale,
-            OUTPUTS.index(layout.output),
-            layout.channels,
-            layout.frames,
-            textures,
-            banks,
-            layout.offset is not None,
-            list(layout.heights or ()),
-            *_network(offset),
-            *_network(layout.decoder),
-            networks == "bfloat16",
-        )
+        self._model = module.Model(_tables(layout, networks))
         self._layout = layout
 
     def freeze(self, texels: Array) -> None:
@@ -199,6 +164,43 @@ def peak(seconds: float = 0.2, variant: str = "") -> float:
     return module.peak(seconds, variant)
 
 
-def _network(network: Network) -> tuple[list[int], list[int], int]:
-    directions = [DIRECTIONS.index(name) for name in network.directions]
-    return list(network.widths), directions, ACTIVATIONS.index(network.activation)
+def _tables(layout: Layout, networks: Networks) -> dict[str, Any]:
+    """A layout as the extension reads it, by name."""
+    textures: list[dict[str, int]] = []
+    banks: list[dict[str, float]] = []
+    at = layout.texels - sum(pyramid.texels for pyramid in layout.pyramids)
+    for pyramid in layout.pyramids:
+        first, count = len(textures), len(pyramid.sizes)
+        for h, w in pyramid.sizes:
+            textures.append({"h": h, "w": w, "start": at})
+            at += h * w
+        moves = {"view": pyramid.view, "light": pyramid.light, "shift": pyramid.shift}
+        banks.append({"channels": pyramid.channels, "first": first, "count": count, **moves})
+    offset = None
+    if layout.offset:
+        offset = {"bank": banks.pop(0), "network": _network(layout.offset[1])}
+    heights = None
+    if layout.heights:
+        heights = {"h": layout.heights[0], "w": layout.heights[1]}
+    return {
+        "wrap": layout.wrap,
+        "aspect": layout.aspect,
+        "depth_scale": layout.depth_scale,
+        "output": layout.output,
+        "channels": layout.channels,
+        "frames": layout.frames,
+        "rounded": networks == "bfloat16",
+        "textures": textures,
+        "banks": banks,
+        "heights": heights,
+        "offset": offset,
+        "decoder": _network(layout.decoder),
+    }
+
+
+def _network(network: Network) -> dict[str, Any]:
+    return {
+        "widths": list(network.widths),
+        "inputs": list(network.directions),
+        "activation": network.activation,
+    }

@@ -1,4 +1,4 @@
-// A tile of queries back through the model: included after neumip_tile.hpp, once a variant.
+// A tile of queries back through the model: included after tile.hpp, once a variant.
 
 // Loss of the tile and the gradient of the decoder's outputs, in decoder_trace.d0.
 NEUMIP_TARGET inline void Tile::judge(const Batch& b, int64_t at, int valid, int n, int loss, float scale,
@@ -128,7 +128,7 @@ NEUMIP_TARGET inline void Tile::back_through_frames(float* d, int n) {
             float* row = d + (3 * k + c) * kStride;
             const float *half = product + 2 * k * kStride, *light = half + kStride;
             for (int i = 0; i < n; i += L)
-                store(row + i, load(row + i) + load(half + i) * load(direction[6 + c] + i) +
-                                   load(light + i) * load(direction[c] + i));
+                store(row + i, load(row + i) + load(half + i) * load(direction[kHx + c] + i) +
+                                   load(light + i) * load(direction[kLx + c] + i));
         }
 }

@@ -1,4 +1,4 @@
-// Networks whose products are of bfloat16, summed in float32: included after neumip_layers.hpp,
+// Networks whose products are of bfloat16, summed in float32: included after layers.hpp,
 // once a variant. The first layer stays float32: its inputs are places on a sharp picture.
 //
 // Where the processor multiplies pairs of bfloat16, two channels lie side by side in one row of

@@ -1,4 +1,4 @@
-// Layers on a tile of queries: included after neumip_vector.hpp, once a variant.
+// Layers on a tile of queries: included after vector.hpp, once a variant.
 //
 // A tile of queries is kept as rows of one number each (channel-major), so that a layer is a
 // small matrix product with the queries along the vector lanes and the weights broadcast.

@@ -14,16 +14,22 @@ from typing import Any, Literal, final
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.program import (
+    Activation,
+    Dense,
+    DepthNetwork,
+    Head,
+    Heights,
+    Program,
+    Texture,
+    frame_products,
+)
+
 Array = NDArray[np.float32]
-Activation = Literal["linear", "relu", "leaky", "sine"]
 Output = Literal["log", "relu", "mask"]
 Networks = Literal["float32", "bfloat16"]
 
 CHANNELS = 8  # numbers a texel
-LEAK = 0.01
-ACTIVATIONS: tuple[Activation, ...] = ("linear", "relu", "leaky", "sine")
-OUTPUTS: tuple[Output, ...] = ("log", "relu", "mask")
-DIRECTIONS = ("lx", "ly", "lz", "vx", "vy", "vz", "hx", "hy", "hz", "cos_diff", "level")
 
 
 @final
@@ -36,6 +42,7 @@ class Pyramid:
         channels: numbers used of a texel, 1 to 8.
         view, light: the lookup lies at uv + depth * (view * H(view) - light * H(light)).
         shift: level of the data, log2(2 * footprint), at which the finest texture is right.
+        name: in the program; its place where it has none.
     """
 
     sizes: tuple[tuple[int, int], ...]
@@ -43,6 +50,7 @@ class Pyramid:
     view: float = 1.0
     light: float = 0.0
     shift: float = 0.0
+    name: str = ""
 
     @property
     def texels(self) -> int:
@@ -56,7 +64,7 @@ class Network:
 
     Attributes:
         widths: inputs (features, then directions), hidden layers, outputs.
-        directions: which of `DIRECTIONS` follow the features.
+        directions: which of `conventions.KERNEL_INPUTS` follow the features.
         activation: after every layer but the last.
     """
 
@@ -76,6 +84,12 @@ class Network:
             at += (a + 1) * b
             found.append((matrix, flat[at - b : at]))
         return found
+
+    def dense(self, flat: NDArray[Any]) -> tuple[Dense, ...]:
+        """The layers as a program has them, views of the flat weights."""
+        layers = self.layers(flat)
+        kinds = (self.activation,) * (len(layers) - 1) + ("linear",)
+        return tuple(Dense(*layer, kind) for layer, kind in zip(layers, kinds, strict=True))
 
 
 @final
@@ -164,3 +178,61 @@ class Layout:
         assert self.heights is not None
         h, w = self.heights
         return texels[: self._rows_of_heights].reshape(-1)[: h * w].reshape(h, w)
+
+    def program(
+        self,
+        weights: NDArray[Any],
+        texels: NDArray[Any],
+        *,
+        channels: tuple[str, ...] = (),
+        grid: tuple[int, int] | None = None,
+        networks: Networks = "float32",
+        released: bool = False,
+        leveled: bool = True,
+    ) -> Program:
+        """The model as data: views of its two flat arrays.
+
+        Args:
+            weights: (self.weights,). texels: (self.texels, 8).
+            channels: names of the answer's; numbers where there are none.
+            grid: (h, w) of the data's; where only the layout is known, one of its aspect.
+            networks: what is multiplied. released: whether `output` is the published program's.
+            leveled: whether footprints count.
+        """
+        first, second = self.split(weights)
+        levels = self.textures(texels)
+        depth: Heights | DepthNetwork | None = None
+        if self.heights:
+            depth = Heights(self.surface(texels), self.depth_scale)
+        if self.offset:
+            pyramid, network = self.offset
+            texture = _texture("offset", pyramid, levels.pop(0))
+            inputs = (*texture.features, *network.directions)
+            depth = DepthNetwork(texture, inputs, network.dense(first), self.depth_scale)
+        textures = tuple(
+            _texture(bank.name or f"bank{k}", bank, found)
+            for k, (bank, found) in enumerate(zip(self.banks, levels, strict=True))
+        )
+        features = [name for texture in textures for name in texture.features]
+        masked = self.output == "mask" or released
+        c = self.channels // 2 if released else self.channels
+        return Program(
+            channels=channels or tuple(str(k) for k in range(c)),
+            grid=grid or self.banks[0].sizes[0],
+            aspect=self.aspect,
+            wrap=self.wrap,
+            textures=textures,
+            inputs=(*features, *frame_products(self.frames), *self.decoder.directions),
+            layers=self.decoder.dense(second),
+            heads=(Head("log", c), Head("mask", c)) if masked else (Head("log", c),),
+            output="released" if released else "relu" if self.output == "relu" else "log",
+            depth=depth,
+            frames=self.frames,
+            leveled=leveled,
+            rounded=networks == "bfloat16",
+        )
+
+
+def _texture(name: str, pyramid: Pyramid, levels: list[Any]) -> Texture:
+    used = tuple(level[..., : pyramid.channels] for level in levels)
+    return Texture(name, used, pyramid.view, pyramid.light, pyramid.shift)

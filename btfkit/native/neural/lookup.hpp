@@ -1,4 +1,4 @@
-// Lookups in textures, and gradients back into them: included after neumip_networks.hpp, once a variant.
+// Lookups in textures, and gradients back into them: included after networks.hpp, once a variant.
 
 // ---------------------------------------------------------------- texture lookups
 

@@ -1,8 +1,4 @@
-// View rays through a texture of heights: included after neumip_lookup.hpp, once a variant.
-
-constexpr int kMarch = 8;          // looks at most along a ray
-constexpr float kSteepest = 0.1f;  // lowest cosine of a ray
-constexpr float kFlattest = 0.3f;  // a ray that grazes the surface moves its crossing no faster
+// View rays through a texture of heights: included after lookup.hpp, once a variant.
 
 #if NEUMIP_LANES == 16
 FN F gathered(const float* p, I at) { return (F)_mm512_i32gather_ps((__m512i)at, p, 4); }
@@ -66,14 +62,14 @@ struct Surface {
         const F size_u = du < all(0.f) ? -du : du, size_v = dv < all(0.f) ? -dv : dv;
         const float rise = top - bottom;
         const F texels = larger(size_u * w, size_v * h) * rise;
-        // ceil, 1 to kMarch
-        const F count = smaller(larger(-floor_of(-texels), all(1.f)), all(float(kMarch)));
+        // ceil, 1 to kLooks
+        const F count = smaller(larger(-floor_of(-texels), all(1.f)), all(float(kLooks)));
         const F part = 1.f / count;
         // Between `high`, above the surface by `gap`, and `low`, below it by -`under`.
         F high = all(top), low = high;
         F gap = high - at(u + high * du, v + high * dv), under = gap;
         I going = ~I{};
-        for (int k = 1; k <= kMarch; ++k) {
+        for (int k = 1; k <= kLooks; ++k) {
             high = select(going, low, high);
             gap = select(going, under, gap);
             const F to = top - rise * smaller(float(k) * part, all(1.f));

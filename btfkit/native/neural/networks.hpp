@@ -1,4 +1,4 @@
-// Networks of layers and what a tile leaves in them: included after neumip_half.hpp, once a variant.
+// Networks of layers and what a tile leaves in them: included after half.hpp, once a variant.
 
 struct Net {
     const Mlp* mlp = nullptr;

@@ -131,48 +131,34 @@ class Zeros {
 // A model's layout, and the scratch that its training keeps between steps.
 class Model {
   public:
-    Model(bool wrap, float aspect, float depth_scale, int output, int channels, int frames,
-          const std::vector<std::vector<int64_t>>& textures,
-          const std::vector<std::vector<double>>& banks, bool offset,
-          const std::vector<int>& heights,
-          const std::vector<int>& offset_widths, const std::vector<int>& offset_directions,
-          int offset_activation, const std::vector<int>& widths,
-          const std::vector<int>& directions, int activation, bool half) {
+    // The tables of a plan, by name: see Kernel in __init__.py.
+    explicit Model(const nb::dict& tables) {
         Plan& p = plan_;
-        p.wrap = wrap;
-        p.aspect = aspect;
-        p.depth_scale = depth_scale;
-        p.output = output;
-        p.channels = channels;
-        p.frames = frames;
-        p.half = half;
+        p.wrap = nb::cast<bool>(tables["wrap"]);
+        p.aspect = nb::cast<float>(tables["aspect"]);
+        p.depth_scale = nb::cast<float>(tables["depth_scale"]);
+        p.output = code_of(kOutputNames, nb::cast<std::string>(tables["output"]), "output");
+        p.channels = nb::cast<int>(tables["channels"]);
+        p.frames = nb::cast<int>(tables["frames"]);
+        p.half = nb::cast<bool>(tables["rounded"]);
         p.pairs = multiplies_pairs();
-        for (const auto& t : textures) {
-            require(t.size() == 3, "a texture is (h, w, start)");
-            p.textures.push_back({int(t[0]), int(t[1]), t[2]});
+        for (nb::handle t : tables["textures"])
+            p.textures.push_back({nb::cast<int>(t["h"]), nb::cast<int>(t["w"]),
+                                  nb::cast<int64_t>(t["start"])});
+        for (nb::handle b : tables["banks"]) p.banks.push_back(bank(b));
+        const nb::object heights = tables["heights"], offset = tables["offset"];
+        if (!heights.is_none()) {
+            p.heights = {nb::cast<int>(heights["h"]), nb::cast<int>(heights["w"]), 0};
+            require(p.heights.h > 0 && p.heights.w > 0, "heights are (h, w)");
         }
-        for (size_t i = 0; i < banks.size(); ++i) {
-            const auto& b = banks[i];
-            require(b.size() == 6, "a bank is (channels, first, count, view, light, shift)");
-            const Bank bank{int(b[0]), int(b[1]), int(b[2]), float(b[3]), float(b[4]), float(b[5])};
-            if (offset && i == 0) p.offset_bank = bank;
-            else p.banks.push_back(bank);
+        p.offset = !offset.is_none();
+        if (p.offset) {
+            p.offset_bank = bank(offset["bank"]);
+            p.offset_mlp = network(offset["network"]);
         }
-        p.offset = offset;
-        if (!heights.empty()) {
-            require(heights.size() == 2 && heights[0] > 0 && heights[1] > 0, "heights are (h, w)");
-            p.heights = {heights[0], heights[1], 0};
-        }
-        if (offset) {
-            p.offset_mlp.widths = offset_widths;
-            p.offset_mlp.directions = offset_directions;
-            p.offset_mlp.activation = offset_activation;
-        }
-        p.decoder.widths = widths;
-        p.decoder.directions = directions;
-        p.decoder.activation = activation;
+        p.decoder = network(tables["decoder"]);
         check(p);
-        p.decoder.start = offset ? p.offset_mlp.size() : 0;
+        p.decoder.start = p.offset ? p.offset_mlp.size() : 0;
     }
 
     Model(const Model&) = delete;
@@ -294,6 +280,20 @@ class Model {
     }
 
   private:
+    static Bank bank(nb::handle b) {
+        return {nb::cast<int>(b["channels"]), nb::cast<int>(b["first"]),
+                nb::cast<int>(b["count"]), nb::cast<float>(b["view"]),
+                nb::cast<float>(b["light"]), nb::cast<float>(b["shift"])};
+    }
+    static Mlp network(nb::handle n) {
+        Mlp m;
+        m.widths = nb::cast<std::vector<int>>(n["widths"]);
+        for (const auto& name : nb::cast<std::vector<std::string>>(n["inputs"]))
+            m.directions.push_back(code_of(kInputNames, name, "input"));
+        m.activation = code_of(kActivationNames, nb::cast<std::string>(n["activation"]),
+                               "activation");
+        return m;
+    }
     static constexpr int64_t kGrain = 256;
     static int useful(int64_t size, int threads) {
         // A thread below four tiles costs more to start than it saves.
@@ -354,10 +354,7 @@ class Model {
 
 NB_MODULE(_neural, m) {
     nb::class_<Model>(m, "Model")
-        .def(nb::init<bool, float, float, int, int, int, const std::vector<std::vector<int64_t>>&,
-                      const std::vector<std::vector<double>>&, bool, const std::vector<int>&,
-                      const std::vector<int>&, const std::vector<int>&, int, const std::vector<int>&,
-                      const std::vector<int>&, int, bool>())
+        .def(nb::init<const nb::dict&>())
         .def_prop_ro("weights", &Model::weights)
         .def_prop_ro("texels", &Model::texels)
         .def("evaluate", &Model::evaluate, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),

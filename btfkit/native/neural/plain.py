@@ -1,37 +1,108 @@
-"""NeuMIP's evaluation in numpy: the twin of the kernels, and what runs where none was built."""
+"""Programs in numpy: the twin of the kernels, and what runs where none was built."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.native.neural.layout import DIRECTIONS, LEAK, Layout, Network, Networks, Pyramid
+from btfkit.conventions import (
+    EPSILON,
+    LEAK,
+    LEVELS_UNIT,
+    LOOKS,
+    LOWEST_COSINE,
+    MOST_LOG,
+    STEEPEST,
+    displacement,
+)
+from btfkit.native.neural.layout import Layout, Networks
+from btfkit.program import Dense, Heights, Program, Texture, frame_products
 
 Array = NDArray[Any]
-# Looks at most along a view ray.
-MARCH = 8
-# Lowest cosine of a view ray through heights: 84 degrees.
-STEEPEST = 0.1
-# Where a ray grazes the surface, its crossing moves no faster than 1 / FLATTEST of a height.
-FLATTEST = 0.3
+Known = dict[str, Array]
+YUV_TO_RGB = np.array([[1, 0, 1.13983], [1, -0.39465, -0.5806], [1, 2.03211, 0]])  # BT.601
+
+
+def answer(
+    program: Program,
+    uv: Array,
+    light: Array,
+    view: Array,
+    footprint: Array | None = None,
+    curvature: Array | None = None,
+) -> tuple[Array, Array]:
+    """Reflectance (b, c) and opacity (b,) of flat queries.
+
+    Args:
+        program: what is computed; its arrays' dtype is that of the answer.
+        uv: (b, 2) in 0..1. light, view: (b, 3) unit vectors above the horizon.
+        footprint: (b,) texels of the data's grid; None is 0.5 throughout.
+        curvature: (b,) 1/tile width; None is the plane.
+    """
+    raw, scaled = _last_layer(program, uv, light, view, footprint, curvature)
+    heads = _heads(program, raw)
+    opacity = np.ones(len(uv), raw.dtype)
+    if "opacity" in heads:
+        opacity = _sigmoid(heads["opacity"][:, 0])
+    if program.output == "cosine":
+        return heads["linear"] * light[:, 2:], opacity
+    if program.output == "released":
+        return released(heads["log"], heads["mask"]), opacity
+    y = heads["log"]
+    if scaled is not None:
+        c = y.shape[1]
+        y = scaled[:, :c] + scaled[:, c:] * y
+    if "mask" in heads:
+        y = y * (0.1 + _sigmoid(heads["mask"]))
+    return np.expm1(np.clip(y, 0, MOST_LOG)), opacity
+
+
+def numbers(
+    program: Program,
+    uv: Array,
+    light: Array,
+    view: Array,
+    footprint: Array | None = None,
+    curvature: Array | None = None,
+) -> Array:
+    """The last layer's numbers (b, outputs), as `answer` takes them."""
+    return _last_layer(program, uv, light, view, footprint, curvature)[0]
+
+
+def depths(program: Program, uv: Array, view: Array, curvature: Array | None = None) -> Array:
+    """Ray depth (b,), tile widths, positive above the plane of uv.
+
+    A lookup lies at uv + depth * D(view), D as `step` gives it.
+    """
+    del curvature  # the plane alone until a march bends its rays
+    found = program.depth
+    if found is None:
+        return np.zeros(len(uv), program.textures[0].levels[0].dtype)
+    if isinstance(found, Heights):
+        along = ray(view, program.aspect, found.scale)
+        met = crossing(found.heights, uv, along, wrap=program.wrap)
+        return met * lift(view) * found.scale
+    psi = bilinear(found.texture.levels[0], uv, wrap=program.wrap)
+    known = _known(view, view, None, None) | _columns(found.texture, psi)
+    return _run(found.layers, found.inputs, known, rounded=program.rounded)[:, 0] * found.scale
 
 
 def evaluate_plain(
     layout: Layout,
-    weights: NDArray[Any],
-    texels: NDArray[Any],
-    uv: NDArray[Any],
-    light: NDArray[Any],
-    view: NDArray[Any],
-    footprint: NDArray[Any] | None = None,
+    weights: Array,
+    texels: Array,
+    uv: Array,
+    light: Array,
+    view: Array,
+    footprint: Array | None = None,
     *,
     raw: bool = False,
     networks: Networks = "float32",
-) -> NDArray[Any]:
-    """Reflectance (b, c) for flat queries; `raw` gives the decoder's numbers instead.
+) -> Array:
+    """The twin of `Kernel.evaluate`: reflectance (b, c); `raw` gives the decoder's numbers instead.
 
     Args:
         layout: the model. weights: (layout.weights,). texels: (layout.texels, 8).
@@ -40,80 +111,56 @@ def evaluate_plain(
         networks: with "bfloat16" the weights and inputs of all layers but the first are rounded
             to it; products are summed as before.
     """
-    known = _directions(light, view, footprint)
-    depth = depths_plain(layout, weights, texels, uv, view, networks=networks)
-    textures = layout.textures(texels)[1 if layout.offset else 0 :]
-    parts = []
-    for bank, levels in zip(layout.banks, textures, strict=True):
-        moved = uv
-        if layout.has_depth and (bank.view or bank.light):
-            move = bank.view * step(view, layout) - bank.light * step(light, layout)
-            moved = uv + depth[:, None] * move
-        parts.append(_between_levels(bank, levels, moved, known["level"] * 8, wrap=layout.wrap))
-    half = np.stack([known[name] for name in ("hx", "hy", "hz")], axis=1)
-    for k in range(layout.frames):
-        axis = parts[0][:, 3 * k : 3 * k + 3]
-        parts += [(axis * direction).sum(axis=1, keepdims=True) for direction in (half, light)]
-    z = _run(layout.decoder, layout.split(weights)[1], parts, known, networks)
+    program = layout.program(weights, texels, networks=networks)
     if raw:
-        return z
-    c = layout.channels
-    y = z[:, :c]
-    if layout.output == "mask":
-        with np.errstate(over="ignore"):
-            y = y * (0.1 + 1 / (1 + np.exp(-z[:, c:])))
-    return np.expm1(np.clip(y, 0, 20))
+        return numbers(program, uv, light, view, footprint)
+    return answer(program, uv, light, view, footprint)[0]
 
 
 def depths_plain(
     layout: Layout,
-    weights: NDArray[Any],
-    texels: NDArray[Any],
-    uv: NDArray[Any],
-    view: NDArray[Any],
+    weights: Array,
+    texels: Array,
+    uv: Array,
+    view: Array,
     *,
     networks: Networks = "float32",
-) -> NDArray[Any]:
-    """Ray depth (b,) of the offset stage, tile widths, positive above the plane of uv.
+) -> Array:
+    """The twin of `Kernel.depths`."""
+    return depths(layout.program(weights, texels, networks=networks), uv, view)
 
-    The lookup lies at uv + depth * H(view), H as `step` gives it.
+
+def released(yuv: Array, mask: Array) -> Array:
+    """Reflectance (b, 3) from the six numbers of NeuMIP's published program.
+
+    Source: the program's default configuration, as docs/neumip.md describes it.
     """
-    if layout.heights is not None:
-        surface = layout.surface(texels)
-        along = ray(view, layout)
-        return crossing(surface, uv, along, wrap=layout.wrap) * lift(view) * layout.depth_scale
-    if layout.offset is None:
-        return np.zeros(len(uv), texels.dtype)
-    pyramid, network = layout.offset
-    psi = bilinear(layout.textures(texels)[0][0], uv, wrap=layout.wrap)[:, : pyramid.channels]
-    known = _directions(view, view, None)
-    raw = _run(network, layout.split(weights)[0], [psi], known, networks)
-    return raw[:, 0] * layout.depth_scale
+    rgb = np.expm1(np.minimum(np.minimum(yuv, MOST_LOG) @ YUV_TO_RGB.T.astype(yuv.dtype), MOST_LOG))
+    return np.maximum(rgb * (0.1 + 1 / (1 + np.exp(-np.clip(mask, -80, 80)))), 0)
 
 
-def step(direction: NDArray[Any], layout: Layout) -> NDArray[Any]:
-    """Displacement (b, 2) in uv of one tile width of depth: H of the paper, v down the rows."""
-    xy = direction[:, :2] / np.maximum(direction[:, 2:], 0.6)
-    return xy * np.asarray([1.0, -layout.aspect], direction.dtype)
+def step(direction: Array, aspect: float) -> Array:
+    """Displacement (b, 2) in uv of one tile width of depth, never faster than at LOWEST_COSINE."""
+    cosine = np.maximum(direction[:, 2], LOWEST_COSINE)
+    return _stacked(*displacement(direction[:, 0], direction[:, 1], cosine, aspect))
 
 
-def ray(view: NDArray[Any], layout: Layout) -> NDArray[Any]:
-    """(b, 2) in uv that a view ray moves while it rises by one unit of the heights."""
-    xy = view[:, :2] / np.maximum(view[:, 2:], STEEPEST) * layout.depth_scale
-    return xy * np.asarray([1.0, -layout.aspect], view.dtype)
+def ray(view: Array, aspect: float, scale: float) -> Array:
+    """(b, 2) in uv that a view ray moves while it rises by one unit of heights of `scale`."""
+    cosine = np.maximum(view[:, 2], STEEPEST)
+    x, y = view[:, 0] / cosine * scale, view[:, 1] / cosine * scale
+    return _stacked(*displacement(x, y, 1, aspect))
 
 
-def lift(view: NDArray[Any]) -> NDArray[Any]:
-    """(b,) ray depth of a height of 1: `step` divides by no less than 0.6, a ray by its cosine."""
-    return np.maximum(view[:, 2], 0.6) / np.maximum(view[:, 2], STEEPEST)
+def lift(view: Array) -> Array:
+    """(b,) ray depth of a height of 1, as `step` counts it."""
+    return np.maximum(view[:, 2], LOWEST_COSINE) / np.maximum(view[:, 2], STEEPEST)
 
 
-def crossing(
-    heights: NDArray[Any], uv: NDArray[Any], along: NDArray[Any], *, wrap: bool
-) -> NDArray[Any]:
+def crossing(heights: Array, uv: Array, along: Array, *, wrap: bool) -> Array:
     """Height (b,) at which rays from above first meet a surface of bilinear heights.
 
-    A ray is at uv + t * along at height t. It is looked at a texel apart, or at MARCH places
+    A ray is at uv + t * along at height t. It is looked at a texel apart, or at LOOKS places
     where it is longer; between two of them the surface is taken as straight, twice.
 
     Args:
@@ -133,7 +180,7 @@ def crossing(
     low = high = np.full(len(uv), top, heights.dtype)
     under = gap = above(low)
     going = np.ones(len(uv), bool)
-    for k in range(1, MARCH + 1):
+    for k in range(1, LOOKS + 1):
         high, gap = np.where(going, low, high), np.where(going, under, gap)
         to = top + (bottom - top) * np.minimum(k / count, 1).astype(heights.dtype)
         found = above(to)
@@ -147,74 +194,32 @@ def crossing(
     return met(high, low, gap, under)
 
 
-def march_steps(along: NDArray[Any], rise: float, size: tuple[int, int]) -> NDArray[Any]:
-    """(b,) looks that a ray takes on its way through heights `rise` apart, 1 to MARCH."""
+def march_steps(along: Array, rise: float, size: tuple[int, int]) -> Array:
+    """(b,) looks that a ray takes on its way through heights `rise` apart, 1 to LOOKS."""
     texels = np.max(np.abs(along) * [size[1], size[0]], axis=1) * rise
-    return np.clip(np.ceil(texels), 1, MARCH)
+    return np.clip(np.ceil(texels), 1, LOOKS)
 
 
-def _directions(
-    light: NDArray[Any], view: NDArray[Any], footprint: NDArray[Any] | None
-) -> dict[str, NDArray[Any]]:
-    total = light + view
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    none = length < 1e-6
-    half = np.where(none, [[0, 0, 1]], total / np.where(none, 1, length)).astype(light.dtype)
-    cos_diff = np.where(none, 0, length / 2)[:, 0].astype(light.dtype)
-    level = np.zeros(len(light), light.dtype)
-    if footprint is not None:
-        level = np.log2(2 * np.clip(footprint, 0.5, 1e30))
-    columns = [*light.T, *view.T, *half.T, cos_diff, level / 8]
-    return dict(zip(DIRECTIONS, columns, strict=True))
-
-
-def _run(
-    network: Network,
-    flat: NDArray[Any],
-    features: Sequence[NDArray[Any]],
-    known: dict[str, NDArray[Any]],
-    networks: Networks,
-) -> NDArray[Any]:
-    x = np.concatenate([*features, *(known[d][:, None] for d in network.directions)], axis=1)
-    layers = network.layers(flat)
-    half = networks == "bfloat16"
-    if half:
-        layers[1:] = [(bfloat16(matrix), bias) for matrix, bias in layers[1:]]
-    for matrix, bias in layers[:-1]:
-        x = x @ matrix.T + bias
-        if network.activation == "relu":
-            x = np.maximum(x, 0)
-        elif network.activation == "leaky":
-            x = np.where(x > 0, x, x * np.asarray(LEAK, x.dtype))
-        elif network.activation == "sine":
-            x = np.sin(x)
-        x = bfloat16(x) if half else x
-    matrix, bias = layers[-1]
-    return x @ matrix.T + bias
-
-
-def bfloat16(x: NDArray[Any]) -> NDArray[Any]:
+def bfloat16(x: Array) -> Array:
     """The nearest numbers of eight significant bits, ties to even, in the dtype of x."""
     bits = np.asarray(x, np.float32).view(np.uint32)
     near = (bits + 0x7FFF + ((bits >> 16) & 1)) & np.uint32(0xFFFF0000)
     return near.view(np.float32).astype(x.dtype)
 
 
-def _between_levels(
-    bank: Pyramid, levels: list[NDArray[Any]], uv: NDArray[Any], level: NDArray[Any], *, wrap: bool
-) -> NDArray[Any]:
-    at = np.clip(level - bank.shift, 0, len(levels) - 1)
-    found = np.zeros((len(uv), bank.channels), levels[0].dtype)
-    for s, texture in enumerate(levels):
-        # The paper's eq. 3 has both weights 0 at whole levels; these sum to 1.
-        weight = np.maximum(0, 1 - np.abs(at - s))
-        rows = np.flatnonzero(weight)
-        value = bilinear(texture, uv[rows], wrap=wrap)[:, : bank.channels]
-        found[rows] += weight[rows, None] * value
-    return found
+def on_disc(direction: Array) -> Array:
+    """(..., 2) directions (..., 3) on the unit disc: azimuth kept, radius 2/pi x polar angle.
+
+    In x and y alone the cosine has an infinite slope at the horizon; in the angle it is smooth.
+    """
+    tangential = np.hypot(direction[..., 0], direction[..., 1])
+    angle = np.arctan2(tangential, direction[..., 2])
+    # At the pole angle / sine is 1.
+    stretch = np.where(tangential > 1e-6, angle / np.maximum(tangential, 1e-6), 1)
+    return direction[..., :2] * (stretch * (2 / np.pi)).astype(direction.dtype)[..., None]
 
 
-def bilinear(texture: NDArray[Any], uv: NDArray[Any], *, wrap: bool) -> NDArray[Any]:
+def bilinear(texture: Array, uv: Array, *, wrap: bool) -> Array:
     """(b, k) of a texture (h, w, k) at uv (b, 2), tiling or clamped at its borders."""
     h, w, _ = texture.shape
     size = np.asarray([w, h], uv.dtype)
@@ -233,3 +238,110 @@ def bilinear(texture: NDArray[Any], uv: NDArray[Any], *, wrap: bool) -> NDArray[
     upper = texture[y0, x0] * (1 - fx) + texture[y0, x1] * fx
     lower = texture[y1, x0] * (1 - fx) + texture[y1, x1] * fx
     return upper * (1 - fy) + lower * fy
+
+
+def _last_layer(
+    program: Program,
+    uv: Array,
+    light: Array,
+    view: Array,
+    footprint: Array | None,
+    curvature: Array | None,
+) -> tuple[Array, Array | None]:
+    """The last layer's numbers, and what the scaling texture says there."""
+    known = _known(light, view, footprint if program.leveled else None, curvature)
+    depth = None if program.depth is None else depths(program, uv, view, curvature)
+    every = [*program.textures, *([program.scaling] if program.scaling else [])]
+    values = []
+    for texture in every:
+        moved = uv
+        if depth is not None and (texture.view or texture.light):
+            toward, away = step(view, program.aspect), step(light, program.aspect)
+            moved = uv + depth[:, None] * (texture.view * toward - texture.light * away)
+        values.append(_between_levels(texture, moved, known["level"] * LEVELS_UNIT, program.wrap))
+    for texture, found in zip(program.textures, values, strict=False):
+        known |= _columns(texture, found)
+    half = np.stack([known[name] for name in ("hx", "hy", "hz")], axis=1)
+    names = iter(frame_products(program.frames))
+    for k in range(program.frames):
+        axis = values[0][:, 3 * k : 3 * k + 3]
+        known |= {next(names): (axis * direction).sum(axis=1) for direction in (half, light)}
+    raw = _run(program.layers, program.inputs, known, rounded=program.rounded)
+    return raw, values[-1] if program.scaling else None
+
+
+def _heads(program: Program, raw: Array) -> dict[str, Array]:
+    found, at = {}, 0
+    for head in program.heads:
+        found[str(head.kind)] = raw[:, at : at + head.count]
+        at += head.count
+    return found
+
+
+def _known(light: Array, view: Array, footprint: Array | None, curvature: Array | None) -> Known:
+    """Every number of `program.INPUTS` that a query holds, (b,) each."""
+    total = light + view
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    none = length < 1e-6
+    half = np.where(none, [[0, 0, 1]], total / np.where(none, 1, length)).astype(light.dtype)
+    cos_diff = np.where(none, 0, length / 2)[:, 0].astype(light.dtype)
+    level = np.zeros(len(light), light.dtype)
+    if footprint is not None:
+        level = np.log2(2 * np.clip(footprint, 0.5, 1e30))
+    bent = np.zeros(len(light), light.dtype) if curvature is None else curvature
+    found = dict(zip(("lx", "ly", "lz", "vx", "vy", "vz"), (*light.T, *view.T), strict=True))
+    found |= dict(zip(("hx", "hy", "hz"), half.T, strict=True))
+    found |= {"cos_diff": cos_diff, "level": level / LEVELS_UNIT, "curvature": bent}
+    found |= dict(zip(("lx_disc", "ly_disc"), on_disc(light).T, strict=True))
+    return found | dict(zip(("vx_disc", "vy_disc"), on_disc(view).T, strict=True))
+
+
+def _columns(texture: Texture, values: Array) -> Known:
+    return dict(zip(texture.features, values.T, strict=True))
+
+
+def _run(
+    layers: Sequence[Dense], inputs: Sequence[str], known: Mapping[str, Array], *, rounded: bool
+) -> Array:
+    x = np.stack([known[name] for name in inputs], axis=1)
+    for k, layer in enumerate(layers):
+        weight = bfloat16(layer.weight) if rounded and k else layer.weight
+        z = x @ weight.T + layer.bias
+        if layer.gain is not None and layer.centre is not None:
+            z = z - z.mean(axis=1, keepdims=True)
+            z = z / np.sqrt(np.square(z).mean(axis=1, keepdims=True) + EPSILON)
+            z = z * layer.gain + layer.centre
+        y = _activated(layer, z if layer.omega == 1 else layer.omega * z)
+        if rounded and k + 1 < len(layers):
+            y = bfloat16(y)
+        x = x + y if layer.residual else y
+    return x
+
+
+def _activated(layer: Dense, z: Array) -> Array:
+    if layer.activation == "relu":
+        return np.maximum(z, 0)
+    if layer.activation == "leaky":
+        return np.where(z > 0, z, z * np.asarray(LEAK, z.dtype))
+    return np.sin(z) if layer.activation == "sine" else z
+
+
+def _between_levels(texture: Texture, uv: Array, level: Array, wrap: bool) -> Array:
+    levels = texture.levels
+    at = np.clip(level - texture.shift, 0, len(levels) - 1)
+    found = np.zeros((len(uv), levels[0].shape[-1]), levels[0].dtype)
+    for s, one in enumerate(levels):
+        # The paper's eq. 3 has both weights 0 at whole levels; these sum to 1.
+        weight = np.maximum(0, 1 - np.abs(at - s))
+        rows = np.flatnonzero(weight)
+        found[rows] += weight[rows, None] * bilinear(one, uv[rows], wrap=wrap)
+    return found
+
+
+def _sigmoid(x: Array) -> Array:
+    with np.errstate(over="ignore"):
+        return 1 / (1 + np.exp(-x))
+
+
+def _stacked(du: Array, dv: Array) -> Array:
+    return np.stack([du, dv], axis=1)

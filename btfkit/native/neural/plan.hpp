@@ -5,19 +5,31 @@
 #include <cstddef>
 #include <cstdint>
 #include <stdexcept>
+#include <string>
 #include <vector>
+
+#include "conventions.hpp"
 
 namespace neumip {
 
+using namespace conventions;
+
 constexpr int kMaxBanks = 4;
 constexpr int kChannels = 8;   // floats a texel; a bank uses the first `channels` of them
-constexpr int kDirections = 11;  // lx ly lz vx vy vz hx hy hz l.h level
 
 enum Activation { kLinear = 0, kRelu = 1, kLeaky = 2, kSine = 3 };
 enum Output { kLog = 0, kLogRelu = 1, kLogMask = 2 };
 enum Loss { kSquare = 0, kAbsolute = 1 };
+constexpr const char* kActivationNames[] = {"linear", "relu", "leaky", "sine"};
+constexpr const char* kOutputNames[] = {"log", "relu", "mask"};
 
-constexpr float kLeak = 0.01f;
+// Place of a name in a table of names.
+template <size_t N>
+int code_of(const char* const (&names)[N], const std::string& name, const char* what) {
+    for (size_t i = 0; i < N; ++i)
+        if (name == names[i]) return int(i);
+    throw std::invalid_argument(std::string("the kernels do not know the ") + what + " " + name);
+}
 
 struct Texture {
     int h, w;
@@ -32,13 +44,13 @@ struct Bank {
 
 struct Mlp {
     std::vector<int> widths;      // inputs, hidden ..., outputs
-    std::vector<int> directions;  // which direction numbers follow the features
+    std::vector<int> directions;  // which inputs follow the features
     int activation = kRelu;
     size_t start = 0;             // floats before it in the flat weights
     int layers() const { return int(widths.size()) - 1; }
     int features() const { return widths[0] - int(directions.size()); }
     bool needs_half() const {
-        return std::any_of(directions.begin(), directions.end(), [](int d) { return d >= 6 && d < 10; });
+        return std::any_of(directions.begin(), directions.end(), [](int d) { return d >= kHx && d <= kCosDiff; });
     }
     size_t size() const {
         size_t n = 0;
@@ -84,8 +96,10 @@ struct Plan {
 inline void check(const Mlp& mlp) {
     require(mlp.layers() >= 1 && mlp.layers() <= 8, "a network has 1 to 8 layers");
     for (int width : mlp.widths) require(width >= 1 && width <= 128, "layer widths are 1 to 128");
-    for (int code : mlp.directions)
-        require(code >= 0 && code < kDirections, "unknown direction number");
+    for (int code : mlp.directions) {
+        require(code >= 0 && code < kInputs, "unknown input");
+        require(code != kCurvature, "the kernels do not know the input curvature");
+    }
     require(mlp.activation >= kLinear && mlp.activation <= kSine, "unknown activation");
     require(mlp.features() >= 1, "a network needs at least one feature");
 }

@@ -1,4 +1,4 @@
-// One tile of queries through the model and back: included after neumip_march.hpp, once a variant.
+// One tile of queries through the model and back: included after march.hpp, once a variant.
 
 // ---------------------------------------------------------------- one tile
 
@@ -13,7 +13,7 @@ struct Tile {
     // of the depth, the gradient of the depth; and channels of one bank
     Rows in, slopes;
     Surface surface{};
-    alignas(64) float direction[kDirections][kTile];
+    alignas(64) float direction[kInputs][kTile];
     alignas(64) float position[2][kTile];
     alignas(64) float gather[kTile][kChannels];
     Lookup offset_list[2];  // of this tile and of the next
@@ -55,7 +55,7 @@ struct Tile {
     // Displacement in uv of one unit of depth along a direction: the paper's H, v down the rows.
     MEMBER void step(const float (*d)[kTile], float* u, float* v, int n) {
         for (int i = 0; i < n; i += L) {
-            const F scale = plan.depth_scale / larger(load(d[2] + i), all(0.6f));
+            const F scale = plan.depth_scale / larger(load(d[2] + i), all(kLowestCosine));
             store(u + i, load(d[0] + i) * scale);
             store(v + i, load(d[1] + i) * scale * -plan.aspect);
         }
@@ -73,7 +73,7 @@ struct Tile {
         levels.finest = true;
         if (footprint == nullptr) {
             std::memset(levels.level, 0, sizeof levels.level);
-            std::memset(direction[10], 0, sizeof direction[10]);
+            std::memset(direction[kLevel], 0, sizeof direction[kLevel]);
             return;
         }
         float widest = 0;
@@ -86,20 +86,20 @@ struct Tile {
         for (int i = 0; i < n; i += L) {
             const F l = log_of(load(levels.level + i)) * 1.4426950408889634f;
             store(levels.level + i, larger(l, all(0.f)));
-            store(direction[10] + i, larger(l, all(0.f)) * 0.125f);
+            store(direction[kLevel] + i, larger(l, all(0.f)) * (1.f / kLevelsUnit));
         }
     }
 
     NEUMIP_TARGET void set_view(const float* view, int valid, int n) {
-        vectors(direction + 3, view, valid, n);
-        if (plan.depth()) step(direction + 3, in[kHu], in[kHv], n);
+        vectors(direction + kVx, view, valid, n);
+        if (plan.depth()) step(direction + kVx, in[kHu], in[kHv], n);
         if (!plan.heights.h) return;
         for (int i = 0; i < n; i += L) {
-            const F z = load(direction[5] + i);
+            const F z = load(direction[kVz] + i);
             const F part = 1.f / larger(z, all(kSteepest)), scale = part * plan.depth_scale;
-            store(in[kRayU] + i, load(direction[3] + i) * scale);
-            store(in[kRayV] + i, load(direction[4] + i) * scale * -plan.aspect);
-            store(in[kLift] + i, larger(z, all(0.6f)) * part);
+            store(in[kRayU] + i, load(direction[kVx] + i) * scale);
+            store(in[kRayV] + i, load(direction[kVy] + i) * scale * -plan.aspect);
+            store(in[kLift] + i, larger(z, all(kLowestCosine)) * part);
         }
     }
 
@@ -115,22 +115,22 @@ struct Tile {
 
     NEUMIP_TARGET void set_light(const float* light, int valid, int n, bool same) {
         if (same)
-            for (int c = 0; c < 3; ++c) std::fill(direction[c], direction[c] + n, light[c]);
+            for (int c = 0; c < 3; ++c) std::fill(direction[kLx + c], direction[kLx + c] + n, light[c]);
         else vectors(direction, light, valid, n);
         if (plan.depth() && plan.needs_light()) step(direction, in[kLu], in[kLv], n);
         if (!plan.needs_half()) return;
         for (int i = 0; i < n; i += L) {
             F h[3];
-            for (int c = 0; c < 3; ++c) h[c] = load(direction[c] + i) + load(direction[3 + c] + i);
+            for (int c = 0; c < 3; ++c) h[c] = load(direction[kLx + c] + i) + load(direction[kVx + c] + i);
             // Opposite directions have no half vector.
             const F square = h[0] * h[0] + h[1] * h[1] + h[2] * h[2];
             const I none = square < all(1e-12f);
             const F safe = select(none, all(1.f), square);
             const F r = 1.f / root(safe);
-            store(direction[6] + i, select(none, all(0.f), h[0] * r));
-            store(direction[7] + i, select(none, all(0.f), h[1] * r));
-            store(direction[8] + i, select(none, all(1.f), h[2] * r));
-            store(direction[9] + i, select(none, all(0.f), square * r * 0.5f));
+            store(direction[kHx] + i, select(none, all(0.f), h[0] * r));
+            store(direction[kHy] + i, select(none, all(0.f), h[1] * r));
+            store(direction[kHz] + i, select(none, all(1.f), h[2] * r));
+            store(direction[kCosDiff] + i, select(none, all(0.f), square * r * 0.5f));
         }
     }
 
@@ -246,8 +246,8 @@ struct Tile {
                 F half = all(0.f), light = all(0.f);
                 for (int c = 0; c < 3; ++c) {
                     const F part = load(x[3 * k + c] + i);
-                    half += part * load(direction[6 + c] + i);
-                    light += part * load(direction[c] + i);
+                    half += part * load(direction[kHx + c] + i);
+                    light += part * load(direction[kLx + c] + i);
                 }
                 store(x[first + 2 * k] + i, half);
                 store(x[first + 2 * k + 1] + i, light);
@@ -297,7 +297,7 @@ struct Tile {
         if (!raw)
             for (int c = 0; c < outputs; ++c)
                 for (int i = 0; i < n; i += L) {
-                    const F y = smaller(larger(answer(c, i), all(0.f)), all(20.f));
+                    const F y = smaller(larger(answer(c, i), all(0.f)), all(kMostLog));
                     store(z[c] + i, exp_of(y) - 1.f);
                 }
         if (outputs == 3) {
@@ -315,7 +315,7 @@ struct Tile {
         }
     }
 
-    // Training: neumip_backward.hpp.
+    // Training: backward.hpp.
     NEUMIP_TARGET void train(const Batch& b, int64_t at, int valid, int next, int loss,
                              float scale, Gradient& g);
     NEUMIP_TARGET void judge(const Batch& b, int64_t at, int valid, int n, int loss, float scale,

@@ -40,6 +40,26 @@ class Prepared(NamedTuple):
     curved: bool
 
 
+class Lights(NamedTuple):
+    """Lights that all queries of a call share.
+
+    Attributes:
+        light: (k, 3) unit vectors of those that are to be answered. rows: (k,) which of the m.
+        good: (m,) whether there is a direction at all.
+    """
+
+    light: Array
+    rows: NDArray[np.intp]
+    good: NDArray[np.bool_]
+
+
+def prepare_lights(light: Array, *, below: bool) -> Lights:
+    """Shared lights (m, 3) made ready; `below`: whether those below the horizon are answered."""
+    unit, good = _unit(light)
+    rows = np.flatnonzero(good if below else good & (unit[:, 2] > 0))
+    return Lights(np.ascontiguousarray(unit[rows]), rows, good)
+
+
 def prepare(
     uv: NDArray[Any],
     light: Array,

@@ -24,6 +24,7 @@ from btfkit.fitting.neumip.engines.device_draw import DeviceSource
 from btfkit.fitting.neumip.engines.triton import Fused, Matrix
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.base import Material
+from btfkit.native.neural.plain import released as released_answer
 from btfkit.native.neural.blur import shares
 from btfkit.native.neural.layout import Array, Layout
 
@@ -227,7 +228,7 @@ def evaluate_on_device(
             blur = torch.from_numpy(np.ascontiguousarray(footprint[rows], np.float32)).to(place)
         batch = (parts[0], parts[1], parts[2], blur)
         found = run.evaluate(weights, texels, batch, raw=released).cpu().numpy()
-        rgb[rows] = evaluated.released_answer(found) if released else found
+        rgb[rows] = released_answer(found[:, :3], found[:, 3:]) if released else found
     rgb[(light[:, 2] <= 0) | (view[:, 2] < 0)] = 0
     return rgb
 

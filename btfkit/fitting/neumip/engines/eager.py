@@ -7,8 +7,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from btfkit.native.neural.layout import DIRECTIONS, LEAK, Layout, Network, Pyramid
-from btfkit.native.neural.plain import FLATTEST, MARCH, STEEPEST
+from btfkit.conventions import (
+    FLATTEST,
+    KERNEL_INPUTS,
+    LEAK,
+    LEVELS_UNIT,
+    LOOKS,
+    LOWEST_COSINE,
+    STEEPEST,
+    displacement,
+)
+from btfkit.native.neural.layout import Layout, Network, Pyramid
 
 
 def forward(
@@ -55,7 +64,8 @@ def ray_depth(layout: Layout, surface: Tensor, uv: Tensor, view: Tensor) -> Tens
     where a ray grazes, by no more than 1 / FLATTEST.
     """
     upward = view[:, 2:].clamp(min=STEEPEST)
-    along = view[:, :2] / upward * view.new_tensor([1.0, -layout.aspect]) * layout.depth_scale
+    moves = displacement(view[:, 0], view[:, 1], upward[:, 0], layout.aspect)
+    along = torch.stack(moves, 1) * layout.depth_scale
     with torch.no_grad():
         t = _crossing(surface, uv, along, wrap=layout.wrap)[:, None]
         here = (uv + t * along).requires_grad_()
@@ -65,15 +75,15 @@ def ray_depth(layout: Layout, surface: Tensor, uv: Tensor, view: Tensor) -> Tens
     clear = (1 - (slope * along).sum(1, keepdim=True)).clamp(min=FLATTEST)
     height = bilinear(surface[..., None], here.detach(), wrap=layout.wrap)
     t = t + (height - height.detach()) / clear
-    return t * view[:, 2:].clamp(min=0.6) / upward * layout.depth_scale
+    return t * view[:, 2:].clamp(min=LOWEST_COSINE) / upward * layout.depth_scale
 
 
 def _crossing(surface: Tensor, uv: Tensor, along: Tensor, *, wrap: bool) -> Tensor:
-    """The twin of `neumip_plain.crossing`."""
+    """The twin of `native.neural.plain.crossing`."""
     h, w = surface.shape
     top, bottom = surface.max(), surface.min()
     texels = (along.abs() * along.new_tensor([w, h])).amax(1) * (top - bottom)
-    count = texels.ceil().clamp(1, MARCH)
+    count = texels.ceil().clamp(1, LOOKS)
 
     def above(t: Tensor) -> Tensor:
         return t - bilinear(surface[..., None], uv + t[:, None] * along, wrap=wrap)[:, 0]
@@ -84,7 +94,7 @@ def _crossing(surface: Tensor, uv: Tensor, along: Tensor, *, wrap: bool) -> Tens
     low = high = top.expand(len(uv))
     under = gap = above(low)
     going = torch.ones(len(uv), dtype=torch.bool, device=uv.device)
-    for k in range(1, MARCH + 1):
+    for k in range(1, LOOKS + 1):
         high, gap = torch.where(going, low, high), torch.where(going, under, gap)
         to = top + (bottom - top) * (k / count).clamp(max=1)
         found = above(to)
@@ -125,12 +135,12 @@ def loss_of(
 
 def step(direction: Tensor, layout: Layout) -> Tensor:
     """Displacement (b, 2) in uv of one tile width of depth: H of the paper, v down the rows."""
-    xy = direction[:, :2] / direction[:, 2:].clamp(min=0.6)
-    return xy * xy.new_tensor([1.0, -layout.aspect])
+    cosine = direction[:, 2].clamp(min=LOWEST_COSINE)
+    return torch.stack(displacement(direction[:, 0], direction[:, 1], cosine, layout.aspect), 1)
 
 
 def directions(light: Tensor, view: Tensor, footprint: Tensor | None) -> dict[str, Tensor]:
-    """Every number of `DIRECTIONS`, (b,) each."""
+    """Every number of `KERNEL_INPUTS` on the plane, (b,) each."""
     total = light + view
     length = torch.linalg.vector_norm(total, dim=1, keepdim=True)
     none = length < 1e-6
@@ -140,8 +150,9 @@ def directions(light: Tensor, view: Tensor, footprint: Tensor | None) -> dict[st
     level = torch.zeros_like(cos_diff)
     if footprint is not None:
         level = torch.log2(2 * footprint.clamp(0.5, 1e30))
-    columns = [*light.T, *view.T, *half.T, cos_diff, level / 8]
-    return dict(zip(DIRECTIONS, columns, strict=True))
+    plane = torch.zeros_like(level)
+    columns = [*light.T, *view.T, *half.T, cos_diff, level / LEVELS_UNIT, plane]
+    return dict(zip(KERNEL_INPUTS, columns, strict=True))
 
 
 def run(
@@ -172,7 +183,7 @@ def _between_levels(
 ) -> Tensor:
     if len(levels) == 1:
         return bilinear(levels[0], uv, wrap=wrap)[:, : bank.channels]
-    level = (known["level"] * 8 - bank.shift).clamp(0, len(levels) - 1)
+    level = (known["level"] * LEVELS_UNIT - bank.shift).clamp(0, len(levels) - 1)
     found = torch.zeros(len(uv), bank.channels, dtype=uv.dtype, device=uv.device)
     for s, texture in enumerate(levels):
         # The paper's eq. 3 has both weights 0 at whole levels; these sum to 1.

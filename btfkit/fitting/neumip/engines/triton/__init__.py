@@ -1,4 +1,4 @@
-"""NeuMIP through fused Triton kernels, behind the face of `neumip_device.Eager`.
+"""NeuMIP through fused Triton kernels, behind the face of `engines.device.Eager`.
 
 Products run on matrix units with factors of 16 bits and sums of 32 where `matrix` says so; lookups,
 phases of sines, losses and sums of gradients are always float32.
@@ -12,8 +12,8 @@ from typing import Any, Literal, final
 import torch
 from torch import Tensor
 
-from btfkit.native.neural.layout import DIRECTIONS, Layout, Network
-from btfkit.native.neural.plain import FLATTEST, MARCH, STEEPEST
+from btfkit.conventions import FLATTEST, KERNEL_INPUTS, LOOKS, STEEPEST
+from btfkit.native.neural.layout import Layout, Network
 
 Matrix = Literal["fp32", "tf32", "bf16", "fp16"]
 MATRICES: tuple[Matrix, ...] = ("fp32", "tf32", "bf16", "fp16")
@@ -22,6 +22,8 @@ Batch = tuple[Tensor, Tensor, Tensor, Tensor | None]
 # Widest layer, and rows of a bank and of the directions in the first one.
 _WIDEST, _TILE = 32, 16
 _MOST_CHANNELS = 64
+# Inputs that the kernels know, in the order of their tile of directions.
+KNOWN_INPUTS = KERNEL_INPUTS[: KERNEL_INPUTS.index("curvature")]
 # Programs add weight gradients to this many copies, so that few meet at one address.
 _COPIES = 16
 # float16 holds errors from 1e-8 on with it; factors above 65504 are cut.
@@ -38,6 +40,8 @@ def uncovered(layout: Layout) -> str:
     networks = [layout.decoder] + ([layout.offset[1]] if layout.offset else [])
     for network in networks:
         hidden = network.widths[1:-1]
+        if unknown := [name for name in network.directions if name not in KNOWN_INPUTS]:
+            return f"an input {unknown[0]!r}; {', '.join(KNOWN_INPUTS)} are known"
         if len(hidden) != 3 or max(hidden) > _WIDEST:
             return f"hidden layers of {hidden}; three of at most {_WIDEST} are known"
     if layout.channels > _MOST_CHANNELS:
@@ -53,7 +57,7 @@ def uncovered(layout: Layout) -> str:
 class Packing:
     """Where a layout's flat weights lie in the kernels' padded ones.
 
-    A network: (16, 32) rows of the directions, in the order of `DIRECTIONS`, then of frames; 32
+    A network: (16, 32) rows of the directions, in the order of `KNOWN_INPUTS`, then of frames; 32
     biases; (16, 32) rows of each pyramid, its 8 numbers twice, once for either level; two hidden
     layers of (32, 32) and 32 biases; the last one, (32, columns) and its biases. "mask" has a
     second last one. Matrices are (in, out). The offset network comes first.
@@ -83,8 +87,8 @@ class Packing:
     ) -> None:
         start = self.size
         banks = start + (_TILE + 1) * _WIDEST
-        width, known = network.widths[1], [len(DIRECTIONS) + j for j in range(2 * frames)]
-        known += [DIRECTIONS.index(name) for name in network.directions]
+        width, known = network.widths[1], [len(KNOWN_INPUTS) + j for j in range(2 * frames)]
+        known += [KNOWN_INPUTS.index(name) for name in network.directions]
         features = torch.tensor(
             [banks + _WIDEST * (_TILE * k + j) for k, n in enumerate(counts) for j in range(n)]
         )
@@ -182,7 +186,7 @@ class Fused:
         *,
         loss: str = "square",
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Loss of a batch as `neumip_torch.loss_of`, its gradients by weights and by texels."""
+        """Loss of a batch as `engines.eager.loss_of`, its gradients by weights and by texels."""
         from btfkit.fitting.neumip.engines.triton import kernels
 
         count, size = len(batch[0]), self._packing.size + 1
@@ -262,7 +266,7 @@ def _config(layout: Layout, packing: Packing, matrix: Matrix, block: int) -> dic
         "output": layout.output,
         "channels": layout.channels,
         "columns": packing.columns,
-        "march": MARCH,
+        "march": LOOKS,
         "steepest": STEEPEST,
         "flattest": FLATTEST,
         "kind": kinds.get(matrix, tl.float32),

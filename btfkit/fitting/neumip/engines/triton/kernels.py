@@ -4,7 +4,7 @@ Imported by the package alone, when a kernel is first wanted. A program works on
 queries: lookups and sums are float32, factors of products are `kind`, their sums float32. A tile of
 features has 16 columns: the 8 numbers of the finer level, then those of the coarser one, each times
 its level's weight; the first layer has their rows twice, and so adds the levels up. The tile of
-directions has them in the order of `DIRECTIONS`, then frames times half vector and light.
+directions has them in the order of `KNOWN_INPUTS`, then frames times half vector and light.
 
 What the arguments hold: `triton.Packing`. The twin of all of it: `engines.eager`.
 """
@@ -13,10 +13,12 @@ import triton
 import triton.language as tl
 
 from btfkit.fitting.neumip.engines.triton.layers import activate, add_layer, add_matrix, back_hidden, back_last, decode, expm1, hidden_layers, last_layer, matrix, times
-from btfkit.fitting.neumip.engines.triton.lookup import between, crossing, direction_tile, directions_of, frame, heights_at, look, ray, scatter, slopes, step, values
+from btfkit.fitting.neumip.engines.triton.lookup import KNOWN, between, crossing, direction_tile, directions_of, frame, heights_at, look, ray, scatter, slopes, step, values
 
 # Floats of the first layer's directions and biases, of a bank's rows, of two hidden layers.
 _DIRECTIONS, _BANK, _HIDDEN = tl.constexpr(17 * 32), tl.constexpr(512), tl.constexpr(2 * 33 * 32)
+# Floats of an offset network: the above, and a last layer of 16 columns.
+_OFFSET = tl.constexpr(17 * 32 + 512 + 2 * 33 * 32 + 33 * 16)
 # A number that happens to be 1 stays a number of its type, and no size compiles anew.
 _NUMBERS = ["count", "height", "width", "copy_stride"]
 
@@ -74,7 +76,7 @@ def _features(
         if k == 0:
             for j in tl.static_range(2 * frames):
                 product = tl.sum(tile * frame(j, half, light), axis=1)[:, None]
-                directions = tl.where(tl.arange(0, 16)[None, :] == 11 + j, product, directions)
+                directions = tl.where(tl.arange(0, 16)[None, :] == KNOWN + j, product, directions)
     z0 += times(directions, matrix(weights, at, 16, 32), kind, exact)
     return z0, directions
 
@@ -93,7 +95,7 @@ def evaluate(
     row, good, u, v, lit, seen, level = _queries(uv, light, view, footprint, count, leveled, block)
     directions, half = direction_tile(lit, seen, level)
     depth = tl.zeros_like(u)
-    at: tl.constexpr = 3696 if stage == "network" else 0
+    at: tl.constexpr = _OFFSET if stage == "network" else 0
     first: tl.constexpr = 1 if stage == "network" else 0
     if stage == "network":
         _, _, _, depth, _ = _offset(
@@ -148,7 +150,7 @@ def gradients(
     row, good, u, v, lit, seen, level = _queries(uv, light, view, footprint, count, leveled, block)
     known, half = direction_tile(lit, seen, level)
     depth = tl.zeros_like(u)
-    at: tl.constexpr = 3696 if stage == "network" else 0
+    at: tl.constexpr = _OFFSET if stage == "network" else 0
     first: tl.constexpr = 1 if stage == "network" else 0
     if stage == "network":
         o0, o1, o2, depth, psi = _offset(
@@ -226,7 +228,7 @@ def gradients(
         by_tile = times(back, tl.trans(matrix(weights, place_of, 16, 32)), kind, exact)
         if k == 0:
             for j in tl.static_range(2 * frames):
-                inside = tl.arange(0, 16)[None, :] == 11 + j
+                inside = tl.arange(0, 16)[None, :] == KNOWN + j
                 by_frame = tl.sum(tl.where(inside, by_frames, 0.0), axis=1)[:, None]
                 by_tile += by_frame * frame(j, half, lit)
         by_tile *= share

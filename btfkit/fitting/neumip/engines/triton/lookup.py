@@ -6,6 +6,12 @@ The twin of all of it: `engines.eager`.
 import triton
 import triton.language as tl
 
+from btfkit.conventions import LEVELS_UNIT, LOWEST_COSINE
+from btfkit.fitting.neumip.engines.triton import KNOWN_INPUTS
+
+KNOWN = tl.constexpr(len(KNOWN_INPUTS))
+_LOWEST, _LEVELS = tl.constexpr(LOWEST_COSINE), tl.constexpr(float(LEVELS_UNIT))
+
 
 @triton.jit
 def _cell(u, v, h, w, wrap: tl.constexpr):
@@ -136,7 +142,7 @@ def directions_of(at, row, good):
 
 @triton.jit
 def direction_tile(light, view, level):
-    """(block, 16) numbers of `DIRECTIONS`, and the half vector."""
+    """(block, 16) numbers of `KNOWN_INPUTS`, and the half vector."""
     x, y, z = light[0] + view[0], light[1] + view[1], light[2] + view[2]
     length = tl.sqrt(x * x + y * y + z * z)
     none = length < 1e-6
@@ -148,11 +154,11 @@ def direction_tile(light, view, level):
     )
     numbers = (
         light[0], light[1], light[2], view[0], view[1], view[2], x, y, z,
-        tl.where(none, 0.0, length * 0.5), level * 0.125,
+        tl.where(none, 0.0, length * 0.5), level / _LEVELS,
     )  # fmt: skip
     column = tl.arange(0, 16)[None, :]
     tile = tl.zeros_like(x)[:, None] + tl.zeros([1, 16], tl.float32)
-    for k in tl.static_range(11):
+    for k in tl.static_range(KNOWN):
         tile = tl.where(column == k, numbers[k][:, None], tile)
     return tile, (x, y, z)
 
@@ -169,8 +175,8 @@ def frame(j: tl.constexpr, half, light):
 
 @triton.jit
 def step(direction, aspect):
-    """uv of one tile width of depth: `neumip_torch.step`."""
-    rise = tl.maximum(direction[2], 0.6)
+    """uv of one tile width of depth: `engines.eager.step`."""
+    rise = tl.maximum(direction[2], _LOWEST)
     return direction[0] / rise, -aspect * direction[1] / rise
 
 
@@ -191,7 +197,7 @@ def _met(high, low, gap, under):
 def crossing(
     texels, span, u, v, along, h, w, good, march: tl.constexpr, wrap: tl.constexpr
 ):  # fmt: skip
-    """`neumip_plain.crossing`; a ray that has met the surface reads no more of it."""
+    """`native.neural.plain.crossing`; a ray that has met the surface reads no more of it."""
     top, bottom = tl.load(span), tl.load(span + 1)
     longest = tl.maximum(tl.abs(along[0]) * w.to(tl.float32), tl.abs(along[1]) * h.to(tl.float32))
     looks = tl.minimum(tl.maximum(tl.ceil(longest * (top - bottom)), 1.0), march)
@@ -220,4 +226,4 @@ def ray(view, aspect, depth_scale, steepest):
     """uv that a ray moves in one unit of height, and its depth there."""
     upward = tl.maximum(view[2], steepest)
     along = (view[0] / upward * depth_scale, -aspect * view[1] / upward * depth_scale)
-    return along, tl.maximum(view[2], 0.6) / upward * depth_scale
+    return along, tl.maximum(view[2], _LOWEST) / upward * depth_scale
