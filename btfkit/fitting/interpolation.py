@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from btfkit.btf import BTF
 from btfkit.errors import FitError
-from btfkit.settings import parsed
 from btfkit.materials.base import Header
 from btfkit.materials.measured.blend import pair_arrays
 from btfkit.materials.measured.interpolation import Interpolation, spec_of
 from btfkit.queries import QuerySet
+from btfkit.settings import parsed
 from btfkit.textures import HALF_RANGE
 
 

@@ -13,10 +13,10 @@ from scipy.ndimage import distance_transform_edt
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.interpolation import images_of
-from btfkit.settings import parsed
 from btfkit.materials.base import Header
 from btfkit.materials.lambert import Lambert, LambertSpec
 from btfkit.queries import QuerySet
+from btfkit.settings import parsed
 
 Sums = tuple[NDArray[np.float64], NDArray[np.float64]]
 # Rows for each texel that a grid of unknown size is given, so that few texels stay empty.

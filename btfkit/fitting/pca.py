@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from btfkit.btf import BTF
 from btfkit.errors import FitError
-from btfkit.fitting.factorisation import LowRank, EncodedRows, factorised
+from btfkit.fitting.factorisation import EncodedRows, LowRank, factorised
 from btfkit.fitting.interpolation import images_of
-from btfkit.settings import parsed
-from btfkit.textures import HALF_RANGE
 from btfkit.materials.base import Header
 from btfkit.materials.measured.blend import pair_arrays
 from btfkit.materials.measured.pca import PCA, Domain, PCASpec
 from btfkit.queries import QuerySet
+from btfkit.settings import parsed
+from btfkit.textures import HALF_RANGE
 
 
 @final

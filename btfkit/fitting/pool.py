@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from btfkit import native
 from btfkit.btf import BTF
-from btfkit.textures import HALF_RANGE
 from btfkit.errors import FitError
+from btfkit.textures import HALF_RANGE
 
 DEFAULT_BYTES = 1 << 30
 # Steps after which a part of a pool that does not hold everything is replaced: a texture for

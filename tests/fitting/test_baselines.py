@@ -21,7 +21,7 @@ import btfkit
 from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import FitError
-from btfkit.fitting import loop, pca
+from btfkit.fitting import loop
 from btfkit.fitting.factorisation import EncodedRows, factorised
 from btfkit.fitting.fit import fit, split
 from btfkit.fitting.lambert import lambert

@@ -10,7 +10,6 @@ import pytest
 
 from btfkit import directions
 from btfkit.btf import BTF
-from btfkit.fitting import MODELS
 from btfkit.fitting.choice import choose, moving
 from btfkit.fitting.fit import fit
 from btfkit.queries import QuerySet

@@ -16,12 +16,12 @@ from btfkit.fitting import loop
 from btfkit.fitting.fit import fit
 from btfkit.fitting.neumip import data, trainable
 from btfkit.fitting.neumip import paper as neumip_paper
+from btfkit.footprint import blurred, gaussian
 from btfkit.materials import file
 from btfkit.materials.base import Header
 from btfkit.materials.neumip.arrays import aligned, name_arrays
 from btfkit.materials.neumip.material import NeuMIP, NeuMIPPaper, in_precision
 from btfkit.materials.neumip.spec import NeuMIPSpec
-from btfkit.footprint import blurred, gaussian
 from btfkit.native import neural as native
 from btfkit.queries import QuerySet
 from btfkit.relief.relief import Relief

@@ -315,7 +315,9 @@ for kernel, more in (
 @pytest.mark.parametrize(("name", "capability"), [("heights, frames", 90), ("sine", 80)])
 def test_kernels_compile_for_gpus_and_use_their_matrix_units(name, capability):
     environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
-    environment["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parents[1] / "native"), *sys.path[1:]])
+    environment["PYTHONPATH"] = os.pathsep.join(
+        [str(Path(__file__).parents[1] / "native"), *sys.path[1:]]
+    )
     done = subprocess.run(
         [sys.executable, "-c", COMPILE, name, str(capability)],
         capture_output=True, text=True, env=environment, check=False,

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from btfkit.fitting.neubtf import augment
 from btfkit.fitting.neubtf.settings import Settings
-from btfkit.fitting.pool import Pool
 from btfkit.fitting.neubtf.unet import STRIDE, Encoder
+from btfkit.fitting.pool import Pool
 
 
 @final

@@ -21,21 +21,21 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from btfkit.btf import BTF
+from btfkit.conventions import LOWEST_COSINE
 from btfkit.fitting import losses
-from btfkit.fitting.neubtf import augment
-from btfkit.fitting.neubtf.guides import Guide, Guides, Window, encode
 from btfkit.fitting.interpolation import images_of
 from btfkit.fitting.loop import Generators, Trainable, restore_tensors, tensors_of
-from btfkit.fitting.neubtf.data import PairDirections, HeldOut, first_latents, frontal_slice
+from btfkit.fitting.neubtf import augment
+from btfkit.fitting.neubtf.data import HeldOut, PairDirections, first_latents, frontal_slice
+from btfkit.fitting.neubtf.guides import Guide, Guides, Window, encode
 from btfkit.fitting.neubtf.settings import Settings
-from btfkit.fitting.pool import Pool
-from btfkit.settings import parsed
-from btfkit.conventions import LOWEST_COSINE
 from btfkit.fitting.neubtf.siren import ParallaxHead, Renderer, on_disc
 from btfkit.fitting.neubtf.unet import Encoder
+from btfkit.fitting.pool import Pool
 from btfkit.materials import neubtf as evaluated
 from btfkit.materials.base import Header
 from btfkit.materials.neubtf import NeuBTFSpec
+from btfkit.settings import parsed
 
 
 @final

@@ -14,17 +14,17 @@ import torch
 from torch import Tensor
 
 from btfkit.errors import FitError
-from btfkit.fitting.neumip.engines import eager
 from btfkit.fitting.adam import adam_plain
 from btfkit.fitting.neumip.data import Batch
-from btfkit.footprint import gaussian
+from btfkit.fitting.neumip.engines import eager
 from btfkit.fitting.neumip.recipe import Recipe, tensors, torch_loss
 from btfkit.fitting.neumip.start import initial_texels
-from btfkit.materials.neumip import material as evaluated
+from btfkit.footprint import gaussian
 from btfkit.materials.base import Material
+from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.spec import NeuMIPSpec
-from btfkit.native.neural.plain import YUV_TO_RGB
 from btfkit.native.neural.layout import Array
+from btfkit.native.neural.plain import YUV_TO_RGB
 
 
 @final

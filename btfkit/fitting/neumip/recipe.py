@@ -14,18 +14,18 @@ from torch import Tensor
 
 from btfkit.btf import BTF, Wrap
 from btfkit.errors import FitError
-from btfkit.fitting.neumip.engines import eager
 from btfkit.fitting.loop import Generators, Trainable
 from btfkit.fitting.neumip.data import Batch, RowSource, Source, TexelSource
+from btfkit.fitting.neumip.engines import eager
 from btfkit.fitting.neumip.settings import Settings
-from btfkit.settings import parsed
-from btfkit.materials.neumip import material as evaluated
-from btfkit.materials.neumip import arrays as neumip_arrays
-from btfkit.materials.base import Header, Material
-from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.footprint import most_levels
+from btfkit.materials.base import Header, Material
+from btfkit.materials.neumip import arrays as neumip_arrays
+from btfkit.materials.neumip import material as evaluated
+from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.native.neural.layout import Array, Layout
 from btfkit.queries import QuerySet
+from btfkit.settings import parsed
 
 # Direction pairs for which a decay of 1 is right; docs/neumip.md has the measurements.
 _DECAY_PAIRS = 60

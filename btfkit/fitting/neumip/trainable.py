@@ -20,8 +20,8 @@ from btfkit.fitting.neumip.data import Batch
 from btfkit.fitting.neumip.recipe import Recipe, torch_loss
 from btfkit.fitting.neumip.settings import INPUTS, Settings
 from btfkit.fitting.neumip.start import initial_texels, initial_weights
-from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.base import Material
+from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.arrays import aligned
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.native.neural import Kernel, available

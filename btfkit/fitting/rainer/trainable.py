@@ -22,15 +22,15 @@ from btfkit import io
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting import losses
-from btfkit.fitting.rainer.networks import Decoder, SetEncoder, TableEncoder
 from btfkit.fitting.interpolation import images_of
 from btfkit.fitting.loop import Generators, Trainable, restore_tensors, tensors_of
+from btfkit.fitting.rainer.networks import Decoder, SetEncoder, TableEncoder
 from btfkit.fitting.rainer.samples import ProbedTexels
-from btfkit.settings import parsed
-from btfkit.materials.base import Header
 from btfkit.materials import file
 from btfkit.materials import rainer as evaluated
+from btfkit.materials.base import Header
 from btfkit.materials.rainer import RainerSpec
+from btfkit.settings import parsed
 
 # Texels encoded at once for the finished texture.
 _CHUNK = 512

@@ -15,18 +15,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from btfkit.fitting.neumip.engines import eager
-from btfkit.fitting.neumip.engines import triton
 from btfkit.fitting.loop import Trainable
-from btfkit.fitting.neumip.trainable import NeuMIP
 from btfkit.fitting.neumip.data import Batch
+from btfkit.fitting.neumip.engines import eager, triton
 from btfkit.fitting.neumip.engines.device_draw import DeviceSource
 from btfkit.fitting.neumip.engines.triton import Fused, Matrix
-from btfkit.materials.neumip import material as evaluated
+from btfkit.fitting.neumip.trainable import NeuMIP
 from btfkit.materials.base import Material
-from btfkit.native.neural.plain import released as released_answer
+from btfkit.materials.neumip import material as evaluated
 from btfkit.native.neural.blur import shares
 from btfkit.native.neural.layout import Array, Layout
+from btfkit.native.neural.plain import released as released_answer
 
 _PARAMETERS = ("weights", "texels")
 _BLOCK = 1 << 20

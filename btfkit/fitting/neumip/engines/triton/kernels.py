@@ -12,8 +12,34 @@ What the arguments hold: `triton.Packing`. The twin of all of it: `engines.eager
 import triton
 import triton.language as tl
 
-from btfkit.fitting.neumip.engines.triton.layers import activate, add_layer, add_matrix, back_hidden, back_last, decode, expm1, hidden_layers, last_layer, matrix, times
-from btfkit.fitting.neumip.engines.triton.lookup import KNOWN, between, crossing, direction_tile, directions_of, frame, heights_at, look, ray, scatter, slopes, step, values
+from btfkit.fitting.neumip.engines.triton.layers import (
+    activate,
+    add_layer,
+    add_matrix,
+    back_hidden,
+    back_last,
+    decode,
+    expm1,
+    hidden_layers,
+    last_layer,
+    matrix,
+    times,
+)
+from btfkit.fitting.neumip.engines.triton.lookup import (
+    KNOWN,
+    between,
+    crossing,
+    direction_tile,
+    directions_of,
+    frame,
+    heights_at,
+    look,
+    ray,
+    scatter,
+    slopes,
+    step,
+    values,
+)
 
 # Floats of the first layer's directions and biases, of a bank's rows, of two hidden layers.
 _DIRECTIONS, _BANK, _HIDDEN = tl.constexpr(17 * 32), tl.constexpr(512), tl.constexpr(2 * 33 * 32)
