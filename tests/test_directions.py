@@ -15,6 +15,7 @@ def test_bonn81_is_theta_major_with_azimuth_ascending() -> None:
     theta, phi = directions.to_angles(directions.bonn81())
     first = {0: 0, 15: 1, 30: 7, 45: 19, 60: 37, 75: 57}
     for polar, index in first.items():
+        # float64 through degrees.
         assert np.degrees(theta[index]) == pytest.approx(polar, abs=1e-9)
         assert np.degrees(phi[index]) == pytest.approx(0, abs=1e-9)
     # 45 degrees: 18 azimuths, every 20 degrees
@@ -64,6 +65,7 @@ def test_half_is_shared_and_diff_turns_around_when_light_and_view_swap(light, vi
 def test_half_and_diff_are_unit_vectors_even_where_light_opposes_view(light, view) -> None:
     for opposite in (view, -light):
         half, diff = directions.half_difference(light, opposite)
+        # float64.
         np.testing.assert_allclose(np.linalg.norm(half), 1, atol=1e-12)
         # the norm of a rotated unit vector, float64
         np.testing.assert_allclose(np.linalg.norm(diff), 1, atol=1e-12)
@@ -72,6 +74,7 @@ def test_half_and_diff_are_unit_vectors_even_where_light_opposes_view(light, vie
 @pytest.mark.parametrize("scale", [1e-300, 1e-20, 1.0, 1e20, 1e300])
 def test_normalize_keeps_direction_at_any_length(scale: float) -> None:
     vector = np.array([[1.0, -2.0, 2.0]])
+    # float64, a few roundings.
     np.testing.assert_allclose(directions.normalize(vector * scale), vector / 3, rtol=1e-14)
 
 

@@ -120,6 +120,7 @@ def test_group_16_texels_that_are_not_measured_are_masked_counted_and_change_not
     assert found.masked == 4 * 4 * 3 + 1
     measured = np.isfinite(holed)
     expected = np.square(answer[measured].astype(np.float64) - truth[measured]).mean()
+    # float32 values, float64 sums.
     assert found.errors()["mse"] == pytest.approx(expected, rel=1e-6)
     pictured = metrics.Pictured()
     pictured.add(answer, holed)

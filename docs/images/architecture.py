@@ -25,6 +25,8 @@ FLOORS = (
     ("textures",),
     ("perceptual",),
     ("jsonvalues", "colour", "directions", "files", "native"),
+    ("program",),
+    ("conventions",),
     ("errors",),
 )
 TORCH = {"bench", "propagation", "fitting"}

@@ -170,6 +170,7 @@ def test_group_12_any_guidance_size_is_encoded_and_stays_periodic(size: tuple[in
         assert texture.shape == (1, 14, *size)
         twice = guides.encode(encoder, guide.repeat(1, 1, 2, 2), wrap=True)
     if all(side % STRIDE == 0 for side in size):
+        # float32 through the encoder.
         torch.testing.assert_close(twice, texture.repeat(1, 1, 2, 2), atol=1e-3, rtol=1e-3)
     assert torch.isfinite(texture).all()
 

@@ -227,7 +227,7 @@ def test_group_29_no_queries_strided_and_float64_inputs():
         found.evaluate(uv[::3], light.astype(float)[::3], np.asfortranarray(view)[::3]).reflectance,
         whole[::3],
     )
-    with pytest.raises(ValueError, match="do not broadcast|could not be broadcast|broadcast"):
+    with pytest.raises(ValueError, match="broadcast"):
         found.evaluate(uv, light[:, None], view[:5])
 
 

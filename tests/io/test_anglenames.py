@@ -108,4 +108,5 @@ def test_the_names_of_bonns_table_give_its_directions() -> None:
     ]
     angles = [anglenames.parse(name) for name in names]
     light, _ = anglenames.light_and_view([a for a in angles if a])
+    # float32 rounding.
     np.testing.assert_allclose(light, directions.bonn81(), atol=1e-7)

@@ -558,6 +558,7 @@ def test_queries_that_are_none_answer_nothing() -> None:
     assert rgb.sum() == 0
     assert opacity.sum() == 0
     fine, whole = trace.answer(flat, [[0.5, 0.5]], UP, UP, [[1e30]])
+    # float32 rounding.
     np.testing.assert_allclose(fine, 1, rtol=1e-6)
     assert whole.item() == 1
 

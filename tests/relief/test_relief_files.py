@@ -55,6 +55,7 @@ def test_normals_in_the_file_are_those_of_the_heights(tmp_path: Path) -> None:
     file.write(relief, tmp_path / "r.exr")
     pixels, channels, _ = images.read_exr("r.exr", (tmp_path / "r.exr").read_bytes())
     normals = np.stack([pixels[..., channels.index(f"N.{axis}")] for axis in "XYZ"], -1)
+    # float32 rounding.
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-5)
     uphill = np.roll(relief.height, -1, 1) > np.roll(relief.height, 1, 1)
     assert (normals[..., 0][uphill] < 0).all()
@@ -116,6 +117,7 @@ def test_an_unknown_material_lists_the_known() -> None:
 def test_direction_sets_start_at_the_pole_and_end_at_75_degrees(name: str, count: int) -> None:
     table = synth.direction_set(name)
     assert table.shape == (count, 3)
+    # float32 rounding.
     np.testing.assert_allclose(table[0], [0, 0, 1], atol=1e-6)
     assert np.degrees(np.arccos(table[:, 2].min())) < 75.5
     assert len(np.unique(np.round(table, 5), axis=0)) == count

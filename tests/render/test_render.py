@@ -1,4 +1,7 @@
-"""The preview renderer: closed forms, frames, shadows, holes, and pictures as files."""
+"""The preview renderer: closed forms, frames, shadows, holes, and pictures as files.
+
+Where nothing else is said, 1e-6 is float32 rounding of values of order 1, 1e-9 and 1e-12 float64.
+"""
 
 from __future__ import annotations
 

@@ -101,6 +101,7 @@ def test_group_8_at_the_pole_every_azimuth_is_one_direction(tmp_path: Path) -> N
 
 def test_group_8_names_are_degrees_and_arrays_are_unit_vectors(tmp_path: Path) -> None:
     btf = btfkit.open(sources.SOURCES["ubo2003"](tmp_path))
+    # float32 rounding.
     np.testing.assert_allclose(np.linalg.norm(btf.light, axis=1), 1, atol=1e-6)
     theta = np.degrees(directions.to_angles(btf.light)[0])
     # Taken for radians, 30 and 60 would be 1719 and 3438 degrees.
@@ -207,6 +208,7 @@ def test_group_10_a_texel_lies_at_its_centre_and_negative_uv_is_floored_not_cut(
     centre = np.stack([(col + 0.5) / 5, (row + 0.5) / 4], axis=-1)
     for tile in ([0, 0], [-1, 0], [0, -1], [-2, -3]):
         rgb = material.evaluate(centre + tile, [0, 0, 1], [0, 0, 1]).reflectance
+        # float32 rounding.
         np.testing.assert_allclose(rgb, texture, rtol=1e-5)
 
 

@@ -175,6 +175,7 @@ def test_group_11_gradients_exist_at_whole_levels_and_beyond_both_ends():
 def test_group_13_blurs_of_any_width_keep_constants(side, variance):
     matrix = gaussian(side, variance, wrap=True)
     assert np.isfinite(matrix).all()
+    # float32 weights of sum 1.
     np.testing.assert_allclose(matrix @ np.full(side, 7.0), 7.0, rtol=1e-6)
 
 
@@ -370,6 +371,7 @@ def test_group_29_inputs_of_any_type_order_and_stride(dtype):
     uv, view = rng.random((64, 2)), upper(rng, 64)
     light = np.tile(UP, (64, 1)).astype(dtype)
     truth = found.evaluate(uv, UP, view).reflectance
+    # float32 rounding.
     np.testing.assert_allclose(found.evaluate(uv, light, view).reflectance, truth, rtol=1e-6)
     odd = np.asfortranarray(np.repeat(view, 2, axis=0))[::2]
     backwards = found.evaluate(uv[::-1], light[::-1], odd[::-1]).reflectance[::-1]
