@@ -27,7 +27,7 @@ from btfkit.fitting import fit as fitting
 from btfkit.fitting import loop
 from btfkit.fitting.neumip import trainable
 from btfkit.fitting.neumip.engines import triton
-from btfkit.fitting.neumip.engines.device import Eager, OnDevice
+from btfkit.fitting.neumip.engines.device import Autograd
 from btfkit.fitting.neumip.engines.triton import Fused
 from btfkit.materials.base import Header
 from btfkit.materials.neumip.spec import NeuMIPSpec, most_levels
@@ -98,7 +98,7 @@ def rates(name: str, count: int, device: torch.device) -> list[dict[str, Any]]:
     weights = torch.from_numpy(0.3 * rng.standard_normal(layout.weights)).float().to(device)
     texels = torch.from_numpy(rng.standard_normal((layout.texels, 8))).float().to(device)
     batch, target = batch_of(count, mixed, device)
-    engines: dict[tuple[str, str, int], Eager | Fused] = {("torch", "fp32", 0): Eager(layout)}
+    engines: dict[tuple[str, str, int], Autograd | Fused] = {("torch", "fp32", 0): Autograd(layout)}
     if device.type == "cuda" and triton.available():
         for matrix in triton.MATRICES:
             for block in (32, 64, 128):
@@ -137,7 +137,7 @@ def whole_steps(count: int, device: torch.device) -> list[dict[str, Any]]:
             btf, pairs[8:], pairs[:8], settings={"size": str(size), "batch": str(count)},
             generators=loop.Generators(0),
         )  # fmt: skip
-        ours = OnDevice(inner, str(device))
+        ours = inner.on_device(str(device))
         stepped = rate(lambda o=ours: o.step(0.5), count, device)
         drawn = rate(lambda i=inner: i.source.batch(0, count), count, torch.device("cpu"))
         rows.append({"size": size, "step_mqs": stepped / 1e6, "draw_mqs": drawn / 1e6})

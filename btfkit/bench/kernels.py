@@ -15,6 +15,7 @@ import numpy as np
 from btfkit import metrics
 from btfkit.bench.machine import peak
 from btfkit.btf import BTF
+from btfkit.fitting.neumip.engines.compiled import Compiled
 from btfkit.fitting.neumip.settings import Settings
 from btfkit.fitting.neumip.start import initial_texels, initial_weights
 from btfkit.fitting.neumip.trainable import NeuMIP, spec_of
@@ -87,7 +88,10 @@ def loop_table(seconds: float = _SECONDS) -> list[dict[str, Any]]:
             settings=settings, generators=Generators(0),
         )  # fmt: skip
         whole = _rate(partial(_steps, trainable), _STEPS * batch, seconds)
-        bare = _rate(trainable.bare_gradient(batch), batch, seconds)
+        engine = trainable.engine
+        if not isinstance(engine, Compiled):
+            raise RuntimeError("the kernels were not built")
+        bare = _rate(engine.gradients_alone(batch), batch, seconds)
         rows.append(
             {
                 "size": size,

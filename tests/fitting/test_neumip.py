@@ -334,7 +334,7 @@ def test_every_level_of_a_smaller_texture_is_trained():
                              settings={"size": "4", "batch": "1024"})  # fmt: skip
     for step in range(3):
         model.step(step / 3)
-    moments = model.layout.textures(model._arrays["texels.second"])
+    moments = model.layout.textures(model.state()["texels.second"].numpy())
     for levels in moments:
         assert all(texture[..., :7].any(axis=-1).all() for texture in levels)
 
@@ -514,4 +514,6 @@ def test_the_published_recipe_blurs_its_textures_nine_times_less(outputs):
         texels = model._current()[1]
         spread.append(texels[16 * 24 : 2 * 16 * 24, 0].std())
     assert spread[0] < 0.2 * spread[1] < spread[2]
-    np.testing.assert_allclose(spread[2], model._arrays["texels"][384:768, 0].std(), rtol=1e-6)
+    np.testing.assert_allclose(
+        spread[2], model.state()["texels"].numpy()[384:768, 0].std(), rtol=1e-6
+    )

@@ -12,17 +12,18 @@ from test_neumip import bumps, material, upper
 from btfkit.errors import FitError
 from btfkit.fitting import fit as fitting
 from btfkit.fitting import loop
-from btfkit.fitting.adam import adam_plain
 from btfkit.fitting.fit import fit
 from btfkit.fitting.neumip import data
 from btfkit.fitting.neumip import paper as neumip_paper
 from btfkit.fitting.neumip import trainable as neumip
 from btfkit.fitting.neumip.engines import device as neumip_device
 from btfkit.fitting.neumip.engines import device_draw
-from btfkit.fitting.neumip.engines.device import Eager, OnDevice, evaluate_on_device
+from btfkit.fitting.neumip.engines.base import Step
+from btfkit.fitting.neumip.engines.device import Autograd, OnDevice, evaluate_on_device
 from btfkit.materials.neumip.material import NeuMIPPaper
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.native import neural as native
+from btfkit.native.neural.adam import adam_plain
 from btfkit.queries import QuerySet
 
 compiled = pytest.mark.skipif(not native.available(), reason="the kernel was not built")
@@ -54,7 +55,7 @@ def steps(trainable, first, last, of=40):
 @compiled
 @pytest.mark.parametrize("settings", SETTINGS)
 def test_on_a_device_a_fit_takes_the_steps_of_the_kernels(settings):
-    ours, theirs = OnDevice(fresh(**settings), "cpu"), fresh(**settings)
+    ours, theirs = fresh(**settings).on_device("cpu"), fresh(**settings)
     losses = steps(ours, 0, 20), steps(theirs, 0, 20)
     # float32 in another order, through 20 steps of Adam: 1e-6 was seen. Offsets begin at 0, and
     # their network with gradients that are next to rounding, which Adam makes as large as others.
@@ -67,9 +68,9 @@ def test_on_a_device_a_fit_takes_the_steps_of_the_kernels(settings):
 
 def test_small_batches_move_the_texels_that_the_twin_moves(monkeypatch):
     monkeypatch.setenv("BTFKIT_PLAIN", "1")
-    ours, theirs = OnDevice(fresh(batch="64"), "cpu"), fresh(batch="64")
-    assert not theirs.next_step(0, theirs.source.batch).dense
-    ours, theirs = OnDevice(fresh(batch="64"), "cpu"), fresh(batch="64")
+    theirs = fresh(batch="64")
+    assert not theirs.plan(0, 64).dense
+    ours, theirs = fresh(batch="64").on_device("cpu"), fresh(batch="64")
     steps(ours, 0, 20), steps(theirs, 0, 20)
     assert apart(ours.state(), theirs.state()) < 1e-3
 
@@ -78,7 +79,7 @@ def test_a_state_goes_to_the_device_and_back():
     whole, first, last = fresh(), fresh(), fresh()
     steps(whole, 0, 20)
     steps(first, 0, 8)
-    between = OnDevice(fresh(), "cpu")
+    between = fresh().on_device("cpu")
     between.restore(first.state())
     steps(between, 8, 14)
     last.restore(between.state())
@@ -89,7 +90,7 @@ def test_a_state_goes_to_the_device_and_back():
 
 
 def test_a_state_is_a_copy_and_restoring_it_repeats_the_steps():
-    ours = OnDevice(fresh(), "cpu")
+    ours = fresh().on_device("cpu")
     steps(ours, 0, 5)
     kept = ours.state()
     again = steps(ours, 5, 10)
@@ -98,7 +99,7 @@ def test_a_state_is_a_copy_and_restoring_it_repeats_the_steps():
 
 
 def test_weights_that_are_no_numbers_are_no_loss():
-    ours = OnDevice(fresh(), "cpu")
+    ours = fresh().on_device("cpu")
     steps(ours, 0, 2)
     state = ours.state()
     ours.restore(state | {"weights": state["weights"] * np.nan})
@@ -106,13 +107,15 @@ def test_weights_that_are_no_numbers_are_no_loss():
 
 
 def test_on_cuda_a_step_tells_the_loss_of_the_one_before():
-    ours = OnDevice(fresh(), "cpu")
-    ours._device = torch.device("cuda")
-    assert [ours._told(torch.tensor(float(k))) for k in range(4)] == [0, 0, 1, 2]
+    ours = fresh().on_device("cpu")
+    engine = ours.engine
+    assert isinstance(engine, OnDevice)
+    engine._place = torch.device("cuda")
+    assert [engine._loss_of_step(torch.tensor(float(k))) for k in range(4)] == [0, 0, 1, 2]
 
 
 def test_slowing_down_halves_the_steps():
-    ours = OnDevice(fresh(), "cpu")
+    ours = fresh().on_device("cpu")
     ours.slow_down()
     inner = fresh()
     inner.slow_down()
@@ -140,7 +143,7 @@ def test_blurs_are_those_of_the_kernels_trainable(settings):
     inner = fresh(**settings)
     texels = inner.state()["texels"]
     neumip_device.smooth(inner.layout, texels, 1.3)
-    inner._smooth(1.3)
+    inner.engine._arrays.settle(Step(1, (0, 0), (0.9, 0.99), dense=True, kept=1, blur=1.3))
     np.testing.assert_allclose(texels.numpy(), inner.state()["texels"].numpy(), atol=1e-6)
 
 
@@ -278,9 +281,9 @@ def test_the_published_recipe_knows_the_cpu_alone():
 @cuda
 @pytest.mark.parametrize("settings", SETTINGS)
 def test_cuda_takes_the_steps_of_the_cpu(settings, monkeypatch):
-    monkeypatch.setattr(neumip_device, "engine", lambda layout, *_, **__: Eager(layout))
+    monkeypatch.setattr(neumip_device, "gradients_on", lambda layout, *_, **__: Autograd(layout))
     torch.backends.cuda.matmul.allow_tf32 = False
-    ours, theirs = OnDevice(fresh(**settings), "cuda"), fresh(**settings)
+    ours, theirs = fresh(**settings).on_device("cuda"), fresh(**settings)
     steps(ours, 0, 40), steps(theirs, 0, 40)
     # float32 in another order, atomics too.
     assert apart(ours.state(), theirs.state()) < 1e-2

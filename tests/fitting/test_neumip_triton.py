@@ -19,11 +19,10 @@ from test_neumip import bumps
 from test_neural import CASES, apart_from_kinks, parameters, queries, relative
 
 from btfkit.fitting import loop
-from btfkit.fitting.neumip import trainable
+from btfkit.fitting.neumip import forward, trainable
 from btfkit.fitting.neumip.engines import device as neumip_device
-from btfkit.fitting.neumip.engines import eager
 from btfkit.fitting.neumip.engines import triton as neumip_triton
-from btfkit.fitting.neumip.engines.device import Eager, OnDevice
+from btfkit.fitting.neumip.engines.device import Autograd
 from btfkit.fitting.neumip.engines.triton import Fused, Packing, uncovered
 from btfkit.native.neural import plain
 
@@ -67,9 +66,9 @@ def by_autograd(case, weights, texels, parts, target, weight, loss, scale=1.0):
     w.requires_grad_()
     t.requires_grad_()
     doubles = tensors(*parts, target, weight, dtype=torch.float64, device="cpu")
-    raw = eager.forward(case, w, t, *doubles[:4])
-    answer = eager.log_answer(case, raw)
-    found = eager.loss_of(case, answer, doubles[4], doubles[5], loss)
+    raw = forward.forward(case, w, t, *doubles[:4])
+    answer = forward.log_answer(case, raw)
+    found = forward.loss_of(case, answer, doubles[4], doubles[5], loss)
     grown = torch.autograd.grad(found * scale, (w, t))
     return found.item(), [g.numpy() / scale for g in grown]
 
@@ -230,8 +229,8 @@ def test_a_fit_with_16_bits_ends_as_well_as_with_32(monkeypatch):
             settings={"batch": "512", "matrix": matrix, "levels": "2"},
             generators=loop.Generators(0),
         )  # fmt: skip
-        ours = OnDevice(found, str(DEVICE))
-        ours._engine = Fused(found.layout, DEVICE, matrix=matrix, block=BLOCK)
+        ours = found.on_device(str(DEVICE))
+        ours.engine._gradients = Fused(found.layout, DEVICE, matrix=matrix, block=BLOCK)
         before = ours.score()
         for k in range(25):
             ours.step(k / 25)
@@ -276,8 +275,8 @@ def test_layouts_that_the_kernels_do_not_know_are_told_and_left_to_torch(monkeyp
     with pytest.raises(ValueError, match="no fused kernel for hidden layers of"):
         Fused(wide, torch.device("cpu"))
     monkeypatch.setattr(neumip_triton, "available", lambda: True)
-    assert isinstance(neumip_device.engine(wide, torch.device("cuda")), Eager)
-    assert isinstance(neumip_device.engine(CASES["sine"], torch.device("cpu")), Eager)
+    assert isinstance(neumip_device.gradients_on(wide, torch.device("cuda")), Autograd)
+    assert isinstance(neumip_device.gradients_on(CASES["sine"], torch.device("cpu")), Autograd)
 
 
 # --- machine code ---------------------------------------------------------------------------------

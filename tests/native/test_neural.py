@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from btfkit.conventions import FLATTEST
-from btfkit.fitting.adam import adam_plain
-from btfkit.fitting.neumip.engines import eager
+from btfkit.fitting.neumip import forward
 from btfkit.materials.base import Header
 from btfkit.materials.file import load, save
 from btfkit.materials.neumip.arrays import aligned, name_arrays
@@ -22,6 +21,7 @@ from btfkit.native import neural as native
 from btfkit.native.draw import Draw, Images
 from btfkit.native.neural import Kernel, plain
 from btfkit.native.neural import blur as neumip_blur
+from btfkit.native.neural.adam import adam_plain
 from btfkit.native.neural.layout import Layout, Network, Pyramid
 
 compiled = pytest.mark.skipif(not native.available(), reason="the kernel was not built")
@@ -327,8 +327,8 @@ def test_gradients_are_those_of_float64_autograd(name, loss, variant):
     ]
     double[0].requires_grad_()
     double[1].requires_grad_()
-    raw = eager.forward(case, *double[:6])
-    wanted = eager.loss_of(case, eager.log_answer(case, raw), double[6], double[7], loss)
+    raw = forward.forward(case, *double[:6])
+    wanted = forward.loss_of(case, forward.log_answer(case, raw), double[6], double[7], loss)
     wanted.backward()
     assert found == pytest.approx(wanted.item(), rel=REL)
     # One query of 1500 beyond a kink of a ReLU or of the loss weighs 1 / 1500.

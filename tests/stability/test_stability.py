@@ -21,8 +21,8 @@ from btfkit.errors import FitError
 from btfkit.fitting import loop, losses
 from btfkit.fitting.fit import fit
 from btfkit.fitting.neubtf.siren import Renderer
+from btfkit.fitting.neumip import forward
 from btfkit.fitting.neumip.data import TexelSource
-from btfkit.fitting.neumip.engines import eager
 from btfkit.fitting.neumip.start import initial_texels
 from btfkit.fitting.neumip.trainable import NeuMIP as Fitted
 from btfkit.footprint import gaussian
@@ -71,8 +71,8 @@ def gradients(
     target = rng.random((len(light), case.channels), np.float32)
     leaves = [torch.from_numpy(a).requires_grad_() for a in (weights, texels)]
     parts = [None if a is None else torch.from_numpy(a) for a in (uv, light, view, footprint)]
-    answer = eager.log_answer(case, eager.forward(case, *leaves, *parts))
-    loss = eager.loss_of(case, answer, torch.from_numpy(target), None, "square")
+    answer = forward.log_answer(case, forward.forward(case, *leaves, *parts))
+    loss = forward.loss_of(case, answer, torch.from_numpy(target), None, "square")
     found = torch.autograd.grad(loss, leaves)
     if native.available():
         kernel = native.Kernel(case, threads=1)
@@ -137,7 +137,7 @@ def test_group_3_opposite_and_grazing_directions_have_a_half_vector_and_gradient
     every = ("lx", "ly", "lz", "vx", "vy", "vz", "hx", "hy", "hz", "cos_diff", "level")
     for part in gradients(light, view, directions=every):
         assert torch.isfinite(part).all()
-    known = eager.directions(torch.from_numpy(light), torch.from_numpy(view), None)
+    known = forward.directions(torch.from_numpy(light), torch.from_numpy(view), None)
     half = torch.stack([known[name] for name in ("hx", "hy", "hz")], dim=1)
     # Two opposite vectors have no bisector: the normal stands in.
     np.testing.assert_allclose(half, np.tile(UP, (4, 1)), atol=1e-6)
@@ -207,7 +207,7 @@ def test_group_16_what_is_not_measured_weighs_nothing_in_loss_and_metrics():
     case = material().layout
     answer = torch.zeros(4, 3, requires_grad=True)
     target = torch.tensor([[1.0, math.nan, math.inf], [-5, 0, 1], [math.nan] * 3, [0, 0, 0]])
-    loss = eager.loss_of(case, answer, target, None, "square")
+    loss = forward.loss_of(case, answer, target, None, "square")
     (grown,) = torch.autograd.grad(loss, answer)
     assert math.isfinite(loss.detach())
     assert torch.isfinite(grown).all()
@@ -224,7 +224,7 @@ def test_group_16_what_is_not_measured_weighs_nothing_in_loss_and_metrics():
 @pytest.mark.parametrize("output", ["log", "relu", "mask"])
 def test_group_17_a_network_that_answers_black_everywhere_still_learns(output):
     trainable = fitted(output=output)
-    trainable._arrays["weights"][-3:] = -0.03 if output == "relu" else -3.0
+    trainable.engine.parameters()[0][-3:] = -0.03 if output == "relu" else -3.0
     first = [trainable.step(0.3) for _ in range(3)][-1]
     for _ in range(150):
         last = trainable.step(0.3)
@@ -309,7 +309,7 @@ def test_group_24_weights_that_are_no_number_are_rolled_back():
     def poisoned(progress: float) -> float:
         calls.append(progress)
         if len(calls) == 30:
-            trainable._arrays["weights"][5] = np.nan
+            trainable.engine.parameters()[0][5] = np.nan
         return step(progress)
 
     trainable.step = poisoned  # type: ignore[method-assign]

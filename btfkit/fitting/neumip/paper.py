@@ -7,6 +7,7 @@ sections 3 and 4, and the program released with it.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar, final
 
 import numpy as np
@@ -14,15 +15,15 @@ import torch
 from torch import Tensor
 
 from btfkit.errors import FitError
-from btfkit.fitting.adam import adam_plain
 from btfkit.fitting.neumip.data import Batch
-from btfkit.fitting.neumip.engines import eager
-from btfkit.fitting.neumip.recipe import Recipe, tensors, torch_loss
+from btfkit.fitting.neumip.forward import forward, loss_of, loss_on_batch, tensors
+from btfkit.fitting.neumip.recipe import Recipe
 from btfkit.fitting.neumip.start import initial_texels
 from btfkit.footprint import gaussian
 from btfkit.materials.base import Material
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.spec import NeuMIPSpec
+from btfkit.native.neural.adam import adam_plain
 from btfkit.native.neural.layout import Array
 from btfkit.native.neural.plain import YUV_TO_RGB
 
@@ -48,7 +49,7 @@ class NeuMIPPaper(Recipe):
             precision=self.settings.precision,  # type: ignore[arg-type]
         )
 
-    def _initial(self, rng: np.random.Generator) -> dict[str, Array]:
+    def _begin(self, rng: np.random.Generator) -> None:
         layout = self.layout
         parts = []
         for network in ([layout.offset[1]] if layout.offset else []) + [layout.decoder]:
@@ -66,7 +67,14 @@ class NeuMIPPaper(Recipe):
         for name, array in list(found.items()):
             found |= {f"{name}.first": np.zeros_like(array), f"{name}.second": np.zeros_like(array)}
         self._progress = np.zeros(1, np.float32)
-        return found | {"progress": self._progress}
+        self._arrays = found | {"progress": self._progress}
+
+    def _tensors(self) -> dict[str, Tensor]:
+        return {name: torch.from_numpy(array.copy()) for name, array in self._arrays.items()}
+
+    def _put(self, state: Mapping[str, Tensor]) -> None:
+        for name, array in self._arrays.items():
+            array[...] = state[name].numpy()
 
     def step(self, progress: float) -> float:
         h, w = self.spec.size
@@ -87,14 +95,14 @@ class NeuMIPPaper(Recipe):
 
     def _loss(self, weights: Tensor, texels: Tensor, batch: Batch) -> Tensor:
         if self.spec.output != "released":
-            return torch_loss(self.layout, weights, texels, batch, "square")
-        raw = eager.forward(self.layout, weights, texels, *tensors(batch))
+            return loss_on_batch(self.layout, weights, texels, batch, "square")
+        raw = forward(self.layout, weights, texels, *tensors(batch))
         mixed = torch.tensor(YUV_TO_RGB, dtype=raw.dtype)
         rgb = torch.expm1((raw[:, :3] @ mixed.T).clamp(max=20))
         rgb = rgb * (0.1 + torch.sigmoid(raw[:, 3:]))
         target = torch.from_numpy(batch.target)
         log = torch.log1p(rgb.clamp(min=-0.1))
-        square = eager.loss_of(self.layout, log, target, None, "square")
+        square = loss_of(self.layout, log, target, None, "square")
         good = torch.isfinite(target)
         linear = torch.where(good, (rgb - torch.where(good, target, 0.0)).abs(), 0.0).mean()
         return square + 0.1 * linear

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,14 +16,13 @@ from btfkit.btf import BTF, Wrap
 from btfkit.errors import FitError
 from btfkit.fitting.loop import Generators, Trainable
 from btfkit.fitting.neumip.data import Batch, RowSource, Source, TexelSource
-from btfkit.fitting.neumip.engines import eager
 from btfkit.fitting.neumip.settings import Settings
 from btfkit.footprint import most_levels
 from btfkit.materials.base import Header, Material
 from btfkit.materials.neumip import arrays as neumip_arrays
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.spec import NeuMIPSpec
-from btfkit.native.neural.layout import Array, Layout
+from btfkit.native.neural.layout import Array
 from btfkit.queries import QuerySet
 from btfkit.settings import parsed
 
@@ -65,7 +64,7 @@ class Recipe(Trainable, ABC):
         self._held = self._source.held_out()
         self._decay = s.decay * min(1.0, _DECAY_PAIRS / max(len(train), 1))
         self._steps, self._rate = 0, 1.0
-        self._arrays = self._initial(generators.numpy)
+        self._begin(generators.numpy)
 
     @property
     def source(self) -> Source:
@@ -84,22 +83,31 @@ class Recipe(Trainable, ABC):
         """The model's shapes for a finest texture of `size`."""
 
     @abstractmethod
-    def _initial(self, rng: np.random.Generator) -> dict[str, Array]:
-        """Weights, texels and their moments before the first step."""
+    def _begin(self, rng: np.random.Generator) -> None:
+        """Make weights, texels and their moments for the first step."""
 
     @abstractmethod
     def _current(self) -> tuple[Array, Array]:
         """Weights and texels as the model would be saved now."""
+
+    @abstractmethod
+    def _tensors(self) -> dict[str, Tensor]:
+        """Copies of all that the steps change, but the counters."""
+
+    @abstractmethod
+    def _put(self, state: Mapping[str, Tensor]) -> None:
+        """Take back what `_tensors` gave."""
+
+    def _answers(self, material: evaluated.NeuMIP, held: Batch) -> Array:
+        """Reflectance (b, c) of a material for the held-out queries."""
+        blur = 0.5 if held.footprint is None else held.footprint
+        return material.evaluate(held.uv, held.light, held.view, blur).reflectance
 
     def material(self) -> Material:
         arrays = neumip_arrays.name_arrays(self.spec, self.layout, *self._current())
         return self.material_type(self.spec, arrays, self._header)
 
     def score(self) -> float:
-        return self.scored(_by_material)
-
-    def scored(self, answers: Callable[[evaluated.NeuMIP, Batch], Array]) -> float:
-        """`score` by whatever answers the held-out queries for a material."""
         held = self._held
         good = np.isfinite(held.target)
         if not good.any():
@@ -109,44 +117,23 @@ class Recipe(Trainable, ABC):
             neumip_arrays.name_arrays(self.spec, self.layout, *self._current()),
             self._header,
         )
-        answer = answers(material, held)
+        answer = self._answers(material, held)
         with np.errstate(invalid="ignore"):
             error = np.log1p(np.maximum(held.target, -0.1)) - np.log1p(answer)
         return float(np.square(error[good]).mean())
 
     def state(self) -> dict[str, Tensor]:
-        found = {name: torch.from_numpy(array.copy()) for name, array in self._arrays.items()}
+        found = self._tensors()
         numbers = [self._steps, self._rate, self.queries]
         return found | {"numbers": torch.tensor(numbers, dtype=torch.float64)}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        for name, array in self._arrays.items():
-            array[...] = state[name].numpy()
+        self._put(state)
         steps, self._rate, queries = state["numbers"].tolist()
         self._steps, self.queries = int(steps), int(queries)
 
     def slow_down(self) -> None:
         self._rate *= 0.5
-
-
-def _by_material(material: evaluated.NeuMIP, held: Batch) -> Array:
-    blur = 0.5 if held.footprint is None else held.footprint
-    return material.evaluate(held.uv, held.light, held.view, blur).reflectance
-
-
-def torch_loss(layout: Layout, weights: Tensor, texels: Tensor, batch: Batch, kind: str) -> Tensor:
-    """The loss of a batch in plain torch, differentiable."""
-    raw = eager.forward(layout, weights, texels, *tensors(batch))
-    answer = eager.log_answer(layout, raw)
-    weight = None if batch.weight is None else torch.from_numpy(batch.weight)
-    return eager.loss_of(layout, answer, torch.from_numpy(batch.target), weight, kind)
-
-
-def tensors(batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """A batch as torch sees it, sharing its memory: uv, light, view, footprint."""
-    blur = None if batch.footprint is None else torch.from_numpy(batch.footprint)
-    uv, light, view = (torch.from_numpy(a) for a in (batch.uv, batch.light, batch.view))
-    return uv, light, view, blur
 
 
 def _header(source: BTF | QuerySet, settings: Settings) -> Header:

@@ -8,147 +8,147 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import partial
-from typing import ClassVar, final
+from typing import final
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from btfkit.fitting.loop import Trainable
-from btfkit.fitting.neumip.data import Batch
-from btfkit.fitting.neumip.engines import eager, triton
-from btfkit.fitting.neumip.engines.device_draw import DeviceSource
+from btfkit.conventions import MOST_LOG
+from btfkit.fitting.neumip import forward
+from btfkit.fitting.neumip.data import Batch, Source
+from btfkit.fitting.neumip.engines import triton
+from btfkit.fitting.neumip.engines.base import MOMENTS, PARAMETERS, Engine, Gradients, Step, Tensors
+from btfkit.fitting.neumip.engines.device_draw import DeviceBatch, DeviceSource
 from btfkit.fitting.neumip.engines.triton import Fused, Matrix
-from btfkit.fitting.neumip.trainable import NeuMIP
-from btfkit.materials.base import Material
 from btfkit.materials.neumip import material as evaluated
+from btfkit.native.neural import Loss
 from btfkit.native.neural.blur import shares
 from btfkit.native.neural.layout import Array, Layout
 from btfkit.native.neural.plain import released as released_answer
 
-_PARAMETERS = ("weights", "texels")
 _BLOCK = 1 << 20
 
 
 @final
-class Eager:
-    """A layout in plain torch, with the face of `triton.Fused`."""
+class Autograd(Gradients):
+    """A layout in plain torch."""
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
 
     def evaluate(
-        self, weights: Tensor, texels: Tensor, batch: triton.Batch, *, raw: bool = False
+        self, weights: Tensor, texels: Tensor, batch: Tensors, *, raw: bool = False
     ) -> Tensor:
-        """Reflectance (b, c) of a batch, or the decoder's raw numbers; no gradients."""
         with torch.no_grad():
-            found = eager.forward(self._layout, weights, texels, *batch)
+            found = forward.forward(self._layout, weights, texels, *batch)
             if raw:
                 return found
-            return torch.expm1(eager.log_answer(self._layout, found).clamp(0, 20))
+            return torch.expm1(forward.log_answer(self._layout, found).clamp(0, MOST_LOG))
 
     def gradients(
         self,
         weights: Tensor,
         texels: Tensor,
-        batch: triton.Batch,
+        batch: Tensors,
         target: Tensor,
         weight: Tensor | None = None,
         *,
         loss: str = "square",
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Loss of a batch as `eager.loss_of`, its gradients by weights and by texels."""
         layout, leaves = self._layout, [p.detach().requires_grad_() for p in (weights, texels)]
-        raw = eager.forward(layout, leaves[0], leaves[1], *batch)
-        answer = eager.log_answer(layout, raw)
-        total = eager.loss_of(layout, answer, target, weight, loss)
+        raw = forward.forward(layout, leaves[0], leaves[1], *batch)
+        answer = forward.log_answer(layout, raw)
+        total = forward.loss_of(layout, answer, target, weight, loss)
         by_weights, by_texels = torch.autograd.grad(total, leaves)
         return total.detach(), by_weights, by_texels
 
 
-def engine(layout: Layout, device: torch.device, *, matrix: Matrix = "bf16") -> Eager | Fused:
-    """What answers, and takes gradients, on a device: fused kernels on CUDA where they can."""
+def gradients_on(layout: Layout, device: torch.device, *, matrix: Matrix = "bf16") -> Gradients:
+    """What takes gradients on a device: fused kernels on CUDA where they can."""
     fused = device.type == "cuda" and triton.available()
     if fused and not triton.uncovered(layout):
         return Fused(layout, device, matrix=matrix)
-    return Eager(layout)
+    return Autograd(layout)
 
 
 @final
-class OnDevice(Trainable):
-    """A NeuMIP trained on a device: the schedule and batches of the one it is made from.
+class OnDevice(Engine[DeviceBatch]):
+    """Parameters, moments and batches on a torch device.
 
     On CUDA nothing waits for a step: its loss is what the step before gave, so that the next batch
     is drawn meanwhile. Texture gradients are added up in any order there: equal seeds give equal
     models to rounding only.
 
     Args:
-        inner: where settings, data, schedule and first parameters come from.
+        layout: the model. state: parameters and moments, as engines name them.
+        source: where the CPU would take its batches from.
         device: "cuda", or "cpu" for the same path without a GPU.
+        loss: as `forward.loss_of`. matrix: what fused kernels round factors of products to.
     """
 
-    model: ClassVar[str] = "neumip"
-
-    def __init__(self, inner: NeuMIP, device: str) -> None:
-        self._inner, self._device = inner, torch.device(device)
-        self._matrix: Matrix = inner.settings.matrix  # type: ignore[assignment]
-        self._engine: Eager | Fused = engine(inner.layout, self._device, matrix=self._matrix)
-        self._source = DeviceSource(inner.source, self._device)
-        self.masked = inner.masked
-        self._tensors = {
-            name: value.to(self._device)
-            for name, value in inner.state().items()
-            if name.split(".")[0] in _PARAMETERS
-        }
+    def __init__(
+        self,
+        layout: Layout,
+        state: Mapping[str, Tensor],
+        source: Source,
+        device: str,
+        *,
+        loss: Loss = "square",
+        matrix: Matrix = "bf16",
+    ) -> None:
+        self.device, self._place = device, torch.device(device)
+        self._layout, self._loss, self._matrix = layout, loss, matrix
+        self._gradients = gradients_on(layout, self._place, matrix=matrix)
+        self._source = DeviceSource(source, self._place)
+        self._tensors = {name: value.to(self._place) for name, value in state.items()}
         self._last: Tensor | None = None
 
-    def step(self, progress: float) -> float:
-        inner, tensors, s = self._inner, self._tensors, self._inner.settings
-        step = inner.next_step(progress, self._source.batch)
-        self.queries, batch = inner.queries, step.batch
-        loss, *found = self._engine.gradients(
+    def batch(self, number: int, count: int) -> DeviceBatch:
+        return self._source.batch(number, count)
+
+    def take(self, batch: DeviceBatch, step: Step) -> float:
+        tensors = self._tensors
+        loss, *gradients = self._gradients.gradients(
             tensors["weights"], tensors["texels"], batch.queries, batch.target, batch.weight,
-            loss=s.loss,
+            loss=self._loss,
         )  # fmt: skip
-        for name, rate, gradient in zip(_PARAMETERS, step.rates, found, strict=True):
-            slots = (tensors[name], tensors[f"{name}.first"], tensors[f"{name}.second"])
-            adam(slots, gradient, rate, step.number, (0.9, s.beta2), dense=step.dense)
+        for name, rate, gradient in zip(PARAMETERS, step.rates, gradients, strict=True):
+            first, second = (tensors[f"{name}.{moment}"] for moment in MOMENTS)
+            slots = (tensors[name], first, second)
+            adam(slots, gradient, rate, step.number, step.betas, dense=step.dense)
         tensors["weights"] *= step.kept
         if step.blur:
-            smooth(inner.layout, tensors["texels"], step.blur)
+            smooth(self._layout, tensors["texels"], step.blur)
         # A depth that is no number is looked up at a border: look at what depths come from.
         good = torch.isfinite(tensors["weights"]).all()
-        if inner.layout.heights:
-            good &= torch.isfinite(inner.layout.surface(tensors["texels"])).all()
-        return self._told(torch.where(good, loss, math.nan))
+        if self._layout.heights:
+            good &= torch.isfinite(self._layout.surface(tensors["texels"])).all()
+        return self._loss_of_step(torch.where(good, loss, math.nan))
 
-    def _told(self, loss: Tensor) -> float:
-        if self._device.type != "cuda":
+    def _loss_of_step(self, loss: Tensor) -> float:
+        if self._place.type != "cuda":
             return float(loss)
         before, self._last = self._last, loss
         return float(loss if before is None else before)
 
-    def material(self) -> Material:
-        self._inner.restore(self.state())
-        return self._inner.material()
-
-    def score(self) -> float:
-        self._inner.restore(self.state())
-        return self._inner.scored(partial(_answers, device=str(self._device), matrix=self._matrix))
+    def parameters(self) -> tuple[Array, Array]:
+        weights, texels = (self._tensors[name].cpu().numpy() for name in PARAMETERS)
+        return weights, texels
 
     def state(self) -> dict[str, Tensor]:
-        copied = {name: tensor.to("cpu", copy=True) for name, tensor in self._tensors.items()}
-        return self._inner.state() | copied
+        return {name: tensor.to("cpu", copy=True) for name, tensor in self._tensors.items()}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        self._inner.restore(state)
-        self.queries, self._last = self._inner.queries, None
+        self._last = None
         for name, tensor in self._tensors.items():
             tensor.copy_(state[name])
 
-    def slow_down(self) -> None:
-        self._inner.slow_down()
+    def answers(self, material: evaluated.NeuMIP, held: Batch) -> Array:
+        return evaluate_on_device(
+            material, held.uv, held.light, held.view, held.footprint,
+            device=self.device, matrix=self._matrix,
+        )  # fmt: skip
 
 
 def adam(
@@ -160,7 +160,7 @@ def adam(
     *,
     dense: bool,
 ) -> None:
-    """`adam.adam_plain` in torch, in place: parameters and both moments."""
+    """`native.neural.adam.adam_plain` in torch, in place: parameters and both moments."""
     parameter, first, second = slots
     m = torch.lerp(first, gradient, 1 - betas[0])
     v = (second * betas[1]).addcmul_(gradient, gradient, value=1 - betas[1])
@@ -178,7 +178,7 @@ def adam(
 
 
 def smooth(layout: Layout, texels: Tensor, sigma: float) -> None:
-    """Blur the finest textures in place by `sigma` texels, as `NeuMIP` does."""
+    """Blur the finest textures in place by `sigma` texels, as on the CPU."""
     for texture in layout.finest(texels):
         for share in shares(sigma**2):
             for axis in (0, 1):
@@ -212,7 +212,7 @@ def evaluate_on_device(
         device: of torch. matrix: what factors of products are rounded to, by fused kernels.
     """
     place = torch.device(device)
-    run = engine(material.layout, place, matrix=matrix)
+    run = gradients_on(material.layout, place, matrix=matrix)
     released = material.spec.output == "released"
     weights, texels = (torch.from_numpy(a).to(place) for a in (material.flat, material.texels))
     rgb = np.zeros((len(uv), len(material.header.channels)), np.float32)
@@ -230,9 +230,3 @@ def evaluate_on_device(
         rgb[rows] = released_answer(found[:, :3], found[:, 3:]) if released else found
     rgb[(light[:, 2] <= 0) | (view[:, 2] < 0)] = 0
     return rgb
-
-
-def _answers(material: evaluated.NeuMIP, held: Batch, *, device: str, matrix: Matrix) -> Array:
-    return evaluate_on_device(
-        material, held.uv, held.light, held.view, held.footprint, device=device, matrix=matrix
-    )

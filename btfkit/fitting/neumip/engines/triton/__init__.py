@@ -1,4 +1,4 @@
-"""NeuMIP through fused Triton kernels, behind the face of `engines.device.Eager`.
+"""NeuMIP through fused Triton kernels, as `device.Gradients` says.
 
 Products run on matrix units with factors of 16 bits and sums of 32 where `matrix` says so; lookups,
 phases of sines, losses and sums of gradients are always float32.
@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from btfkit.conventions import FLATTEST, KERNEL_INPUTS, LOOKS, STEEPEST
+from btfkit.fitting.neumip.engines.base import Gradients, Tensors
 from btfkit.native.neural.layout import Layout, Network
 
 Matrix = Literal["fp32", "tf32", "bf16", "fp16"]
 MATRICES: tuple[Matrix, ...] = ("fp32", "tf32", "bf16", "fp16")
-Batch = tuple[Tensor, Tensor, Tensor, Tensor | None]
 
 # Widest layer, and rows of a bank and of the directions in the first one.
 _WIDEST, _TILE = 32, 16
@@ -138,7 +138,7 @@ class Packing:
 
 
 @final
-class Fused:
+class Fused(Gradients):
     """One layout's kernels on a device.
 
     Args:
@@ -161,7 +161,7 @@ class Fused:
         self._config = _config(layout, self._packing, matrix, block)
 
     def evaluate(
-        self, weights: Tensor, texels: Tensor, batch: Batch, *, raw: bool = False
+        self, weights: Tensor, texels: Tensor, batch: Tensors, *, raw: bool = False
     ) -> Tensor:
         """Reflectance (b, c) of a batch, or the decoder's raw numbers; no gradients."""
         from btfkit.fitting.neumip.engines.triton import kernels
@@ -180,13 +180,13 @@ class Fused:
         self,
         weights: Tensor,
         texels: Tensor,
-        batch: Batch,
+        batch: Tensors,
         target: Tensor,
         weight: Tensor | None = None,
         *,
         loss: str = "square",
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Loss of a batch as `engines.eager.loss_of`, its gradients by weights and by texels."""
+        """Loss of a batch as `forward.loss_of`, its gradients by weights and by texels."""
         from btfkit.fitting.neumip.engines.triton import kernels
 
         count, size = len(batch[0]), self._packing.size + 1
@@ -210,7 +210,7 @@ class Fused:
         return *(layout.heights or (1, 1)), float(layout.aspect), float(layout.depth_scale)
 
     def _common(
-        self, weights: Tensor, texels: Tensor, batch: Batch
+        self, weights: Tensor, texels: Tensor, batch: Tensors
     ) -> tuple[tuple[Tensor, ...], dict[str, Any]]:
         layout = self._layout
         span = texels

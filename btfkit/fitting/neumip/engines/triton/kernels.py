@@ -6,7 +6,7 @@ features has 16 columns: the 8 numbers of the finer level, then those of the coa
 its level's weight; the first layer has their rows twice, and so adds the levels up. The tile of
 directions has them in the order of `KNOWN_INPUTS`, then frames times half vector and light.
 
-What the arguments hold: `triton.Packing`. The twin of all of it: `engines.eager`.
+What the arguments hold: `triton.Packing`. The twin of all of it: `neumip.forward`.
 """
 
 import triton

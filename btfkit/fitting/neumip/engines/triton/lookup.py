@@ -1,6 +1,6 @@
 """Textures, directions and ray depths in Triton: parts of `kernels`.
 
-The twin of all of it: `engines.eager`.
+The twin of all of it: `neumip.forward`.
 """
 
 import triton
@@ -175,7 +175,7 @@ def frame(j: tl.constexpr, half, light):
 
 @triton.jit
 def step(direction, aspect):
-    """uv of one tile width of depth: `engines.eager.step`."""
+    """uv of one tile width of depth: `forward.step`."""
     rise = tl.maximum(direction[2], _LOWEST)
     return direction[0] / rise, -aspect * direction[1] / rise
 

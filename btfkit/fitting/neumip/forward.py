@@ -17,6 +17,7 @@ from btfkit.conventions import (
     STEEPEST,
     displacement,
 )
+from btfkit.fitting.neumip.data import Batch
 from btfkit.native.neural.layout import Layout, Network, Pyramid
 
 
@@ -215,3 +216,19 @@ def bilinear(texture: Tensor, uv: Tensor, *, wrap: bool) -> Tensor:
     upper = flat[y0 * w + x0] * (1 - fx) + flat[y0 * w + x1] * fx
     lower = flat[y1 * w + x0] * (1 - fx) + flat[y1 * w + x1] * fx
     return upper * (1 - fy) + lower * fy
+
+
+def loss_on_batch(
+    layout: Layout, weights: Tensor, texels: Tensor, batch: Batch, kind: str
+) -> Tensor:
+    """The loss of a batch, differentiable."""
+    answer = log_answer(layout, forward(layout, weights, texels, *tensors(batch)))
+    weight = None if batch.weight is None else torch.from_numpy(batch.weight)
+    return loss_of(layout, answer, torch.from_numpy(batch.target), weight, kind)
+
+
+def tensors(batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """A batch as torch sees it, sharing its memory: uv, light, view, footprint."""
+    blur = None if batch.footprint is None else torch.from_numpy(batch.footprint)
+    uv, light, view = (torch.from_numpy(a) for a in (batch.uv, batch.light, batch.view))
+    return uv, light, view, blur

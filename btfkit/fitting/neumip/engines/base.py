@@ -1,0 +1,102 @@
+"""What every engine is: the parameters of a NeuMIP, and how they take a step."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sized
+from dataclasses import dataclass
+from typing import Generic, TypeVar, final
+
+from torch import Tensor
+
+from btfkit.fitting.neumip.data import Batch
+from btfkit.materials.neumip.material import NeuMIP
+from btfkit.native.neural.layout import Array
+
+# Names of what is trained, and of the moments that Adam keeps of each.
+PARAMETERS = ("weights", "texels")
+MOMENTS = ("first", "second")
+# uv, light, view and footprint of queries.
+Tensors = tuple[Tensor, Tensor, Tensor, Tensor | None]
+B = TypeVar("B", bound=Sized)
+
+
+@final
+@dataclass(frozen=True)
+class Step:
+    """What is done with the gradient of a batch.
+
+    Attributes:
+        number: of the step, from 1.
+        rates: of Adam, for the weights and for the texels. betas: of its moments.
+        dense: whether texels without a gradient move, too.
+        kept: factor on the weights afterwards. blur: of the finest textures afterwards, texels.
+    """
+
+    number: int
+    rates: tuple[float, float]
+    betas: tuple[float, float]
+    dense: bool
+    kept: float
+    blur: float
+
+
+class Gradients(ABC):
+    """What answers, and takes gradients, of one layout whose parameters torch holds."""
+
+    @abstractmethod
+    def evaluate(
+        self, weights: Tensor, texels: Tensor, batch: Tensors, *, raw: bool = False
+    ) -> Tensor:
+        """Reflectance (b, c) of a batch, or the decoder's raw numbers; no gradients."""
+
+    @abstractmethod
+    def gradients(
+        self,
+        weights: Tensor,
+        texels: Tensor,
+        batch: Tensors,
+        target: Tensor,
+        weight: Tensor | None = None,
+        *,
+        loss: str = "square",
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Loss of a batch as `forward.loss_of`, its gradients by weights and by texels."""
+
+
+class Engine(ABC, Generic[B]):
+    """Parameters and moments, where batches are drawn, and what takes gradients and steps.
+
+    Equal states, batches and steps lead to equal states, on a GPU to rounding only. A state of one
+    engine is one of every other.
+
+    Attributes:
+        device: torch's name of where the parameters are.
+    """
+
+    device: str = "cpu"
+
+    @abstractmethod
+    def batch(self, number: int, count: int) -> B:
+        """The `count` queries with answers of step `number`, where the engine reads them."""
+
+    @abstractmethod
+    def take(self, batch: B, step: Step) -> float:
+        """One step; its loss, or NaN where parameters are no numbers any more."""
+
+    @abstractmethod
+    def parameters(self) -> tuple[Array, Array]:
+        """Weights and texels as they stand, in the CPU's memory."""
+
+    @abstractmethod
+    def state(self) -> dict[str, Tensor]:
+        """Copies of parameters and moments, on the CPU."""
+
+    @abstractmethod
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Take back what `state` gave."""
+
+    def answers(self, material: NeuMIP, held: Batch) -> Array:
+        """Reflectance (b, c) of a material for the held-out queries."""
+        blur = 0.5 if held.footprint is None else held.footprint
+        return material.evaluate(held.uv, held.light, held.view, blur).reflectance

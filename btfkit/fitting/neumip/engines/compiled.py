@@ -1,0 +1,134 @@
+"""Engines on the CPU: the compiled kernels, and where none was built, autograd and numpy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from btfkit.fitting.neumip.data import Batch, Source
+from btfkit.fitting.neumip.engines.base import MOMENTS, PARAMETERS, Engine, Step
+from btfkit.fitting.neumip.forward import loss_on_batch
+from btfkit.native.neural import Kernel, Loss
+from btfkit.native.neural.adam import adam_plain
+from btfkit.native.neural.blur import blur
+from btfkit.native.neural.layout import Array, Layout
+
+
+@final
+class Arrays:
+    """Weights, texels and their moments in numpy, as `state` names them."""
+
+    def __init__(self, layout: Layout, arrays: dict[str, Array]) -> None:
+        self._layout, self._arrays = layout, arrays
+
+    def parameters(self) -> tuple[Array, Array]:
+        """Weights and texels."""
+        return self._arrays["weights"], self._arrays["texels"]
+
+    def slots(self, name: str) -> tuple[Array, Array, Array]:
+        """A parameter and both its moments."""
+        first, second = (self._arrays[f"{name}.{moment}"] for moment in MOMENTS)
+        return self._arrays[name], first, second
+
+    def settle(self, step: Step) -> bool:
+        """What follows Adam: decay and blur; whether what depths come from is finite."""
+        weights, texels = self.parameters()
+        weights *= np.float32(step.kept)
+        if step.blur:
+            # A relief is found from its large forms to its small ones.
+            for texture in self._layout.finest(texels):
+                blur(texture, step.blur**2, wrap=self._layout.wrap)
+        # A depth that is no number is looked up at a border, with a finite loss.
+        good = np.isfinite(weights).all()
+        if self._layout.heights:
+            good &= np.isfinite(self._layout.surface(texels)).all()
+        return bool(good)
+
+    def state(self) -> dict[str, Tensor]:
+        """Copies of all arrays."""
+        return {name: torch.from_numpy(array.copy()) for name, array in self._arrays.items()}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Take back what `state` gave."""
+        for name, array in self._arrays.items():
+            array[...] = state[name].numpy()
+
+
+@final
+class Compiled(Engine[Batch]):
+    """The kernels: gradients and Adam in C++, summed over its threads in between."""
+
+    def __init__(
+        self, layout: Layout, arrays: dict[str, Array], source: Source, loss: Loss
+    ) -> None:
+        self._arrays, self._source, self._loss = Arrays(layout, arrays), source, loss
+        self._kernel = Kernel(layout)
+
+    def batch(self, number: int, count: int) -> Batch:
+        return self._source.batch(number, count)
+
+    def take(self, batch: Batch, step: Step) -> float:
+        loss = self._gradients(batch)
+        weights, texels = (self._arrays.slots(name) for name in PARAMETERS)
+        self._kernel.adam(
+            weights, texels, lr=step.rates, step=step.number, betas=step.betas, dense=step.dense
+        )
+        return loss if self._arrays.settle(step) else math.nan
+
+    def _gradients(self, batch: Batch) -> float:
+        loss, _ = self._kernel.train(
+            *self.parameters(), batch.uv, batch.light, batch.view, batch.footprint, batch.target,
+            batch.weight, loss=self._loss,
+        )  # fmt: skip
+        return loss
+
+    def gradients_alone(self, count: int) -> Callable[[], object]:
+        """A call that takes the gradient of one and the same batch again: the kernel alone."""
+        batch = self.batch(0, count)
+        return lambda: self._gradients(batch)
+
+    def parameters(self) -> tuple[Array, Array]:
+        return self._arrays.parameters()
+
+    def state(self) -> dict[str, Tensor]:
+        return self._arrays.state()
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        self._arrays.restore(state)
+
+
+@final
+class Plain(Engine[Batch]):
+    """Where no kernel was built: autograd on the CPU, and the kernels' twins for the rest."""
+
+    def __init__(
+        self, layout: Layout, arrays: dict[str, Array], source: Source, loss: Loss
+    ) -> None:
+        self._arrays, self._source = Arrays(layout, arrays), source
+        self._layout, self._loss = layout, loss
+
+    def batch(self, number: int, count: int) -> Batch:
+        return self._source.batch(number, count)
+
+    def take(self, batch: Batch, step: Step) -> float:
+        weights, texels = (torch.from_numpy(a).requires_grad_() for a in self.parameters())
+        loss = loss_on_batch(self._layout, weights, texels, batch, self._loss)
+        gradients = torch.autograd.grad(loss, (weights, texels))
+        for name, rate, gradient in zip(PARAMETERS, step.rates, gradients, strict=True):
+            slots = self._arrays.slots(name)
+            adam_plain(slots, gradient.numpy(), rate, step.number, step.betas, dense=step.dense)
+        return float(loss.detach()) if self._arrays.settle(step) else math.nan
+
+    def parameters(self) -> tuple[Array, Array]:
+        return self._arrays.parameters()
+
+    def state(self) -> dict[str, Tensor]:
+        return self._arrays.state()
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        self._arrays.restore(state)
