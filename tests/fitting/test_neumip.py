@@ -517,3 +517,35 @@ def test_the_published_recipe_blurs_its_textures_nine_times_less(outputs):
     np.testing.assert_allclose(
         spread[2], model.state()["texels"].numpy()[384:768, 0].std(), rtol=1e-6
     )
+
+
+@pytest.mark.parametrize(
+    ("model", "given", "message"),
+    [
+        ("neumip", {"outputs": "6"}, r"neumip has no setting outputs"),
+        ("neumip-paper", {"frames": "2"}, r"neumip-paper has no setting frames; it has levels"),
+        ("neumip-paper", {"rate": "0.1"}, r"neumip-paper has no setting rate"),
+        ("neumip", {"offset_width": "8"}, r"does not use offset_width \(depth=heights has no"),
+        ("neumip", {"offset": "0", "depth": "network"}, r"not use depth \(offset=0 leaves"),
+        ("neumip", {"omega": "3"}, r"not use omega \(no layer ends in sines\)"),
+        (
+            "neumip",
+            {"features": "4"} | {"frames": "2"},
+            r"frames \(a frame takes 3 features of 4\)",
+        ),
+        ("neumip", {"wrap": "clamp"}, r"not use wrap \(textures say it themselves\)"),
+        ("neumip-paper", {"wrap": "clamp"}, r"not use wrap"),
+    ],
+)
+def test_a_setting_that_a_recipe_does_not_use_is_refused_by_name(model, given, message):
+    with pytest.raises(ValueError, match=message):
+        fit(bumps(), model=model, steps=1, settings=given)
+
+
+def test_queries_do_not_use_a_pool_of_textures():
+    rng = np.random.default_rng(0)
+    rows = QuerySet(
+        rng.random((50, 2)), upper(rng, 50), upper(rng, 50), rgb=rng.random((50, 3)), size=(8, 8)
+    )
+    with pytest.raises(ValueError, match=r"not use pool_mb \(queries are in memory already\)"):
+        fit(rows, model="neumip", steps=1, settings={"pool_mb": "64"})

@@ -18,6 +18,7 @@ from btfkit.errors import FitError
 from btfkit.fitting.neumip.data import Batch
 from btfkit.fitting.neumip.forward import forward, loss_of, loss_on_batch, tensors
 from btfkit.fitting.neumip.recipe import Recipe
+from btfkit.fitting.neumip.settings import PaperSettings
 from btfkit.fitting.neumip.start import initial_texels
 from btfkit.footprint import gaussian
 from btfkit.materials.base import Material
@@ -29,11 +30,12 @@ from btfkit.native.neural.plain import YUV_TO_RGB
 
 
 @final
-class NeuMIPPaper(Recipe):
+class NeuMIPPaper(Recipe[PaperSettings]):
     """The published recipe: Adam at a constant rate, blurred textures, batches of 4 a texel."""
 
     model: ClassVar[str] = "neumip-paper"
     material_type: ClassVar[type[Material]] = evaluated.NeuMIPPaper
+    settings_type = PaperSettings
 
     def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:
         c = len(self._header.channels)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from btfkit.btf import BTF, Wrap
 from btfkit.errors import FitError
 from btfkit.fitting.loop import Generators, Trainable
 from btfkit.fitting.neumip.data import Batch, RowSource, Source, TexelSource
-from btfkit.fitting.neumip.settings import Settings
+from btfkit.fitting.neumip.settings import Shared, refuse_unused
 from btfkit.footprint import most_levels
 from btfkit.materials.base import Header, Material
 from btfkit.materials.neumip import arrays as neumip_arrays
@@ -26,14 +26,14 @@ from btfkit.native.neural.layout import Array
 from btfkit.queries import QuerySet
 from btfkit.settings import parsed
 
-# Direction pairs for which a decay of 1 is right; docs/neumip.md has the measurements.
-_DECAY_PAIRS = 60
+S = TypeVar("S", bound=Shared)
 
 
-class Recipe(Trainable, ABC):
+class Recipe(Trainable, ABC, Generic[S]):
     """What both recipes share: data, flat parameters, state, score."""
 
     material_type: ClassVar[type[Material]]
+    settings_type: type[S]
 
     def __init__(
         self,
@@ -45,7 +45,8 @@ class Recipe(Trainable, ABC):
         generators: Generators,
         progress: Any = None,
     ) -> None:
-        self.settings = s = parsed(Settings, self.model, settings)
+        self.settings = s = parsed(self.settings_type, self.model, settings)
+        refuse_unused(s, self.model, settings, pictures=isinstance(source, BTF))
         self._generators = generators
         self._header = _header(source, s)
         size = _texture_size(self._header.grid, s.size)
@@ -62,8 +63,8 @@ class Recipe(Trainable, ABC):
             self._source = RowSource(source, train, test, seed=generators.seed)
         self.masked = self._source.masked
         self._held = self._source.held_out()
-        self._decay = s.decay * min(1.0, _DECAY_PAIRS / max(len(train), 1))
         self._steps, self._rate = 0, 1.0
+        self._pairs = len(train)
         self._begin(generators.numpy)
 
     @property
@@ -136,7 +137,7 @@ class Recipe(Trainable, ABC):
         self._rate *= 0.5
 
 
-def _header(source: BTF | QuerySet, settings: Settings) -> Header:
+def _header(source: BTF | QuerySet, settings: Shared) -> Header:
     if isinstance(source, BTF):
         return Header.of(source)
     if source.size is None:

@@ -29,14 +29,17 @@ from btfkit.native.neural.layout import Array
 
 _SMOOTH_STEPS = 16
 _SMOOTH_HALVES = 5
+# Direction pairs for which a decay of 1 is right; docs/neumip.md has the measurements.
+_DECAY_PAIRS = 60
 
 
 @final
-class NeuMIP(Recipe):
+class NeuMIP(Recipe[Settings]):
     """NeuMIP with what docs/neumip.md found to be better; an engine takes its steps."""
 
     model: ClassVar[str] = "neumip"
     material_type: ClassVar[type[Material]] = evaluated.NeuMIP
+    settings_type = Settings
 
     def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:
         return spec_of(self.settings, size, levels, len(self._header.channels))
@@ -89,7 +92,7 @@ class NeuMIP(Recipe):
             # A batch that touches few texels leaves the others, moments and all, as they are.
             dense=6 * count > self.layout.texels,
             # Few directions say little about those between: small weights bend little.
-            kept=1 - rates[0] * self._decay,
+            kept=1 - rates[0] * s.decay * min(1.0, _DECAY_PAIRS / max(self._pairs, 1)),
             blur=smooth * 2 ** (-_SMOOTH_HALVES * progress),
         )
 
