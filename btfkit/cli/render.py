@@ -144,13 +144,16 @@ def _directions(option: str, angles: tuple[tuple[float, float], ...]) -> Floats:
 
 
 def _at_hand(material: Material) -> Material:
-    """The same material, in memory where it is a small BTF."""
+    """The same material, in memory where it is a small BTF that is read lazily."""
     import numpy as np
 
     from btfkit.materials.measured.interpolation import Interpolation
+    from btfkit.textures import Textures
 
     lazy: Any = material.weights.get("texture")
-    if not isinstance(material, Interpolation) or 4 * math.prod(lazy.shape) > _IN_MEMORY:
+    if not (isinstance(material, Interpolation) and isinstance(lazy, Textures)):
+        return material
+    if 4 * math.prod(lazy.shape) > _IN_MEMORY:
         return material
     texture = lazy.batch(np.arange(len(lazy)))
     return Interpolation(material.spec, {**material.weights, "texture": texture}, material.header)
