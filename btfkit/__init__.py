@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         FormatError,
     )
     from btfkit.fitting.fit import fit
+    from btfkit.heldout import split
     from btfkit.io import open
     from btfkit.materials.base import Material
     from btfkit.materials.file import load
@@ -35,6 +36,7 @@ _HOMES = {
     "fit": "btfkit.fitting.fit",
     "load": "btfkit.materials.file",
     "open": "btfkit.io",
+    "split": "btfkit.heldout",
 }
 __all__ = [
     "BTF",
@@ -50,6 +52,7 @@ __all__ = [
     "fit",
     "load",
     "open",
+    "split",
 ]
 
 

@@ -62,7 +62,7 @@ def propagate(
         progress: called with (stages done, stages).
 
     Raises:
-        FitError: the model has no encoder.
+        FitError: the model has no encoder, or one that was never trained.
         FormatError: the guidance or the model cannot be read.
         ValueError: a guidance with no size, too large, or with channels that no image has.
     """
@@ -214,6 +214,7 @@ def _fitted(
             f"{os.fspath(path)} has no encoder (a propagated NeuBTF has none)",
             remedy="name the model that was fitted",
         )
+    _check_trained(path, material)
     encoder = Encoder(material.spec.latents, torch.Generator())
     try:
         encoder.load_state_dict(weights)
@@ -221,6 +222,20 @@ def _fitted(
         raise FormatError(path, f"the encoder does not fit this version ({error})") from error
     mean, deviation = (torch.from_numpy(arrays[name]) for name in ("mean", "deviation"))
     return material, encoder.eval(), mean, deviation
+
+
+def _check_trained(path: str | os.PathLike[str], material: NeuBTF) -> None:
+    """Refuse an encoder that was never trained, warn of one that hardly was."""
+    parts = [str(part) for part in material.header.provenance.get("untrained", ())]
+    encoder = next((part for part in parts if part.startswith("the encoder")), None)
+    if encoder is None:
+        return
+    if "not begun" in encoder:
+        raise FitError(
+            f"{os.fspath(path)} is of a fit that ended early: {encoder}",
+            remedy="go on with it: btfkit fit --model neubtf --resume, or fit anew for longer",
+        )
+    warnings.warn(f"{os.fspath(path)} is of a fit that ended early: {encoder}", stacklevel=4)
 
 
 def _image(guidance: str | os.PathLike[str] | Array) -> tuple[Array, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -35,6 +37,7 @@ def errors_on_btf(
     btf: BTF,
     *,
     pairs: ArrayLike | None = None,
+    within_s: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Errors over whole textures.
@@ -42,12 +45,15 @@ def errors_on_btf(
     Args:
         material: what answers.
         btf: what was measured.
-        pairs: indices of the pairs to compare; None takes all.
-        progress: called with (pairs done, pairs).
+        pairs: indices of the pairs to compare, in this order; None takes all.
+        within_s: seconds after which no further pair is taken; at least one is. None takes all.
+        progress: called with (per mille done, 1000).
 
     Returns:
         mse, psnr, mse_log1p, psnr_log1p, mae, psnr_srgb (pooled over all texels), ssim_srgb and
-        flip (means over pairs), mean_psnr (mean over pairs of each pair's own), pairs, masked.
+        flip (means over pairs), mean_psnr (mean over pairs of each pair's own, but of
+        `exact_pairs`, whose own is infinite; None where no other is left), pairs that were
+        compared, of_pairs, masked.
 
     Raises:
         ValueError: channels differ, or nothing is measured.
@@ -59,20 +65,31 @@ def errors_on_btf(
     chosen = np.arange(len(btf)) if pairs is None else np.asarray(pairs, np.intp)
     pooled, pictured = metrics.Pooled(), metrics.Pictured()
     own: list[float] = []
-    for done, pair in enumerate(chosen):
+    start, done = time.perf_counter(), 0
+    for pair in chosen:
         truth, answer = btf.texture(int(pair)), answer_pair(material, btf, int(pair))
         pooled.add(answer, truth)
         pictured.add(answer, truth)
         measured = np.isfinite(truth)
         if measured.any():
             own.append(metrics.psnr(float(np.square(answer - truth)[measured].mean())))
+        done += 1
+        spent = time.perf_counter() - start
+        share = done / len(chosen) if within_s is None else max(
+            done / len(chosen), min(spent / within_s, 1.0))  # fmt: skip
         if progress:
-            progress(done + 1, len(chosen))
+            progress(int(1000 * share), 1000)
+        # Another pair takes about as long as those before.
+        if within_s is not None and pooled.values and spent * (done + 1) / done > within_s:
+            break
+    finite = [value for value in own if math.isfinite(value)]
     return {
         **pooled.errors(),
         **pictured.errors(),
-        "mean_psnr": float(np.mean(own)),
-        "pairs": len(chosen),
+        "mean_psnr": float(np.mean(finite)) if finite else None,
+        "exact_pairs": len(own) - len(finite),
+        "pairs": done,
+        "of_pairs": len(chosen),
         "masked": pooled.masked,
     }
 

@@ -23,7 +23,8 @@ from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting import loop
 from btfkit.fitting.factorisation import EncodedRows, factorised
-from btfkit.fitting.fit import fit, split
+from btfkit.fitting.fit import fit
+from btfkit.heldout import split
 from btfkit.fitting.lambert import lambert
 from btfkit.fitting.rainer import trainable as rainer
 from btfkit.fitting.rainer.networks import Decoder, SetEncoder
