@@ -100,6 +100,12 @@ class BTF:
     def __len__(self) -> int:
         return self.shape[0]
 
+    def __repr__(self) -> str:
+        """Short: sizes, and where it comes from."""
+        sizes = " x ".join(map(str, self.shape))
+        source = self.provenance.get("source", self.provenance.get("made", "memory"))
+        return f"BTF({sizes}, {self.wrap}, of {str(source)[:80]})"
+
     def texture(self, index: int) -> NDArray[np.float32]:
         """(h, w, c) texture of pair `index`, linear; NaN where it is not valid."""
         image = self.textures[index]

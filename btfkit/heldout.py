@@ -13,8 +13,8 @@ from btfkit.btf import BTF
 from btfkit.queries import QuerySet
 
 Index = NDArray[np.intp]
-# Textures that tell one BTF from another with the same directions.
-_LOOKED_AT = 3
+# Textures that tell one BTF from another.
+_LOOKED_AT = 8
 
 
 def split(count: int, holdout: float = 0.05, seed: int = 0) -> tuple[Index, Index]:
@@ -46,8 +46,9 @@ def split(count: int, holdout: float = 0.05, seed: int = 0) -> tuple[Index, Inde
 def fingerprint(source: BTF | QuerySet) -> dict[str, Any]:
     """SHA-256 by which the data of a fit are known again, and what it was taken of.
 
-    Of a BTF: shape, channels, directions, positions and three textures, rounded as a float16
-    store rounds them, so that a folder and its store are the same; of queries everything.
+    Of a BTF: shape, channels and eight textures, rounded as a float16 store rounds them, so that a
+    folder and its store are the same (directions are normalised anew each time they are read, and
+    differ by rounding); of queries everything.
     """
     digest = hashlib.sha256(repr(source.channels).encode())
     if isinstance(source, QuerySet):
@@ -57,10 +58,9 @@ def fingerprint(source: BTF | QuerySet) -> dict[str, Any]:
         of = "queries and answers"
     else:
         digest.update(repr(source.shape).encode())
-        parts = [source.light, source.view, source.light_position, source.view_position]
         chosen = np.unique(np.linspace(0, len(source) - 1, _LOOKED_AT).astype(int))
-        parts += [_rounded(source.texture(int(pair))) for pair in chosen]
-        of = f"directions and textures {', '.join(map(str, chosen))}"
+        parts = [_rounded(source.texture(int(pair))) for pair in chosen]
+        of = f"textures {', '.join(map(str, chosen))}"
     for part in parts:
         digest.update(b"none" if part is None else np.ascontiguousarray(part).tobytes())
     return {"sha256": digest.hexdigest(), "of": of}

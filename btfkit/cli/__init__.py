@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import sys
 
 import click
@@ -58,7 +57,4 @@ def main() -> None:
     """Entry point of the `btfkit` command."""
     from btfkit.cli.outcome import run
 
-    # OpenMP threads that spin at barriers starve each other on a busy machine: with both cores
-    # taken, a fit of small steps ran 39 times slower than with threads that sleep.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     sys.exit(run(btfkit, sys.argv[1:]))

@@ -67,6 +67,7 @@ def ingest_verb(
         jobs=jobs,
         force=force,
         progress=bar,
+        phase=bar.phase,
     )
     btf = btfkit.open(path)
     n, h, w, c = btf.shape

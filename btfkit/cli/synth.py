@@ -38,8 +38,8 @@ class FloatsType(click.ParamType[tuple[float, ...]]):
 @click.option("--list", "listing", is_flag=True, help="List the materials.")
 @click.option("--as", "kind", type=click.Choice(KINDS), default="zarr", show_default=True)
 @click.option("--size", type=click.IntRange(8, 4096), default=128, show_default=True)
-@click.option("--views", default="bonn81", show_default=True, help="bonn81, bonn151 or a number.")
-@click.option("--lights", default="bonn81", show_default=True, help="bonn81, bonn151 or a number.")
+@click.option("--views", default="19", show_default=True, help="bonn81, bonn151 or a number.")
+@click.option("--lights", default="19", show_default=True, help="bonn81, bonn151 or a number.")
 @click.option("--relief", "relief_texels", type=float, help="Height of the structure, texels.")
 @click.option("--bounces", type=click.IntRange(0, 16), default=0, help="Interreflections.")
 @click.option(
@@ -98,9 +98,11 @@ def synth_verb(
         raise click.UsageError("Missing option '-o' / '--out'.")
     if kind != "queries" and curvature is not None:
         raise click.UsageError("--curvature is for --as queries")
+    bar.phase("making the relief")
     relief = procedural.make(
         name, size, relief_texels=relief_texels, seed=seed, wrap="clamp" if clamp else "wrap"
     )
+    bar.phase("tracing and writing")
     if kind == "relief":
         from btfkit.relief.file import write
 

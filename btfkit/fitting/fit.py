@@ -55,6 +55,9 @@ def fit(
 ) -> FitReport:
     """Fit a model.
 
+    `import btfkit` makes OpenMP's threads sleep where they wait (OMP_WAIT_POLICY=PASSIVE), unless
+    torch was imported before it: on a busy machine such a fit is several times slower.
+
     Args:
         source: a BTF, queries with answers, or a relief (traced on a Bonn-81 grid first).
         model: a name of `MODELS`, or "auto".

@@ -19,7 +19,7 @@ _MOST_BYTES = 128 << 20
 
 
 def read_once(source: BTF | QuerySet) -> BTF | QuerySet:
-    """The same data; textures that are asked for one by one are kept for who asks next."""
+    """The same data; textures that are asked for one by one, or few, are kept for who asks next."""
     if isinstance(source, QuerySet):
         return source
     return replace(source, textures=Once(source), validity=None)
@@ -76,6 +76,10 @@ class Once(Textures):
             for slot, image in known.items():
                 images[slot] = image
         self._count(index, images)
+        if self._most >= len(self):
+            # All of it has room: whoever comes next needs no decoding.
+            with self._lock:
+                self._kept.update(zip(index.tolist(), images, strict=True))
         return images
 
     def texels(self, pairs: Index, rows: Index, cols: Index) -> Array:

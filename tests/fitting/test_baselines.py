@@ -683,13 +683,16 @@ def test_autoencoders_beat_lambert(model: str) -> None:
 
 
 def test_reports_of_closed_forms_are_whole(tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
+    seen: dict[str, list[tuple[int, int]]] = {}
     fit(
         in_memory(), model="pca", out=tmp_path / "m.safetensors", settings={"rank": "3"},
-        progress=lambda done, total: seen.append((done, total)),
+        progress=lambda done, total: seen[list(seen)[-1]].append((done, total)),
+        phase=lambda name, left: seen.setdefault(name, []),
     )  # fmt: skip
-    assert seen == sorted(seen)
-    assert seen[-1][0] == seen[-1][1]
+    assert list(seen) == ["reading", "writing", "evaluating"]
+    for part in (seen["reading"], seen["evaluating"]):
+        assert part == sorted(part)
+        assert part[-1][0] == part[-1][1]
     report = json.loads((tmp_path / "m.report.json").read_text())
     assert report["model"] == "pca"
     assert report["bytes"] > 0
