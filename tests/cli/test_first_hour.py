@@ -499,3 +499,78 @@ def test_ctrl_c_ends_a_fit_with_what_it_has(here: Path) -> None:
     assert "go on: btfkit fit wool.btf.zarr --model neubtf --budget 60s --resume" in said
     assert (here / "wool.neubtf.safetensors").is_file()
     assert (here / "wool.neubtf.safetensors.state").is_file()
+
+
+# --- tile
+
+
+def dotted() -> np.ndarray:
+    """(128, 128, 3) codes: dark dots on pure white, thicker towards one end."""
+    rows, cols = np.indices((128, 128))
+    rng = np.random.default_rng(1)
+    image = np.full((128, 128, 3), 255, np.uint8)
+    for y, x in rng.integers(0, 128, (30, 2)):
+        image[(rows - y) ** 2 + (cols - x) ** 2 < 4 + y / 4] = (40, 80, 160)
+    return image
+
+
+def drawn(path: Path, image: np.ndarray) -> None:
+    from skimage.io import imsave
+
+    imsave(path, image, check_contrast=False)
+
+
+def test_white_paper_stays_white_when_it_is_tiled(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from skimage.io import imread
+
+    drawn(here / "dots.png", dotted())
+    assert run(command, ["tile", "dots.png"]) == 0
+    said = capsys.readouterr().out
+    assert "taken away (--no-drift leaves it)" in said
+    assert run(command, ["tile", "dots.png", "--no-drift", "-o", "plain.png"]) == 0
+    assert "taken away" not in capsys.readouterr().out
+    bent, plain = imread(here / "dots.tile.png"), imread(here / "plain.png")
+    # Equal maps: what the plain tile takes from white paper is white in the bent one.
+    white = plain == 255
+    assert white.mean() > 0.5
+    assert (bent[white] == 255).all()
+    assert (bent != plain).any()
+    # Without the correction every texel is one of the picture.
+    assert set(np.unique(plain)) <= set(np.unique(dotted()))
+
+
+def test_both_ends_of_a_range_stay_and_what_lies_between_keeps_its_order() -> None:
+    from btfkit.synthesis.textures import within
+
+    values = np.linspace(0, 1, 1001, dtype=np.float32)
+    for gain in (0.5, 0.84, 1.0, 1.2, 1.9):
+        bent = within(values, np.full_like(values, gain), 1.0)
+        assert (bent[0], bent[-1]) == (0, 1)
+        assert (np.diff(bent) > 0).all()
+        dark = values < 0.9 / 1.9
+        np.testing.assert_allclose(bent[dark], gain * values[dark], rtol=1e-6)  # float32
+
+
+def test_a_store_can_keep_its_drift(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ramp = np.linspace(0.5, 1, 32, dtype=np.float32)[:, None, None]
+    rng = np.random.default_rng(2)
+    textures = ramp * (0.3 + 0.5 * rng.random((4, 32, 32, 3), np.float32))
+    up = np.tile([0, 0, 1.0], (4, 1))
+    writer.write(BTF(textures, up, up), here / "shaded.btf.zarr")
+    for more in ((), ("--no-drift",)):
+        found = typed(capsys, "tile", "shaded.btf.zarr", "--force", *more)
+        assert (found["drift"] > 0.1) == (not more)
+    # Half precision: the store's own values.
+    tile = btfkit.open(here / "shaded.tile.btf.zarr").texture(0)
+    assert np.isin(tile, btfkit.open(here / "shaded.btf.zarr").texture(0)).all()
+
+
+def test_a_chequerboard_that_tiles_has_no_seam(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    board = (np.indices((64, 64)) // 8).sum(axis=0) % 2 * 255
+    drawn(here / "board.png", board.astype(np.uint8))
+    found = typed(capsys, "tile", "board.png")
+    assert found["seam_ratio"] == pytest.approx(1)
