@@ -133,7 +133,11 @@ class BTF:
         return np.where(valid[..., None], values, np.float32(np.nan))
 
     def abrdf(self, row: int, col: int) -> NDArray[np.float32]:
-        """(n, c) apparent BRDF of one texel: its value under every pair."""
+        """(n, c) apparent BRDF of one texel: its value under every pair.
+
+        That reads every texture once. A store then keeps a band of rows of all of them at hand, so
+        that texels nearby cost nothing; of other sources ask for several at once by `texels`.
+        """
         pairs = np.arange(len(self))
         return self.texels(pairs, np.full_like(pairs, row), np.full_like(pairs, col))
 
