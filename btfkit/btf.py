@@ -102,9 +102,10 @@ class BTF:
 
     def __repr__(self) -> str:
         """Short: sizes, and where it comes from."""
-        sizes = " x ".join(map(str, self.shape))
+        n, h, w, c = self.shape
         source = self.provenance.get("source", self.provenance.get("made", "memory"))
-        return f"BTF({sizes}, {self.wrap}, of {str(source)[:80]})"
+        said = f"{n} textures of {w} x {h}, {c} channels, {self.wrap}"
+        return f"BTF({said}, of {str(source)[:80]})"
 
     def texture(self, index: int) -> NDArray[np.float32]:
         """(h, w, c) texture of pair `index`, linear; NaN where it is not valid."""

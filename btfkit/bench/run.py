@@ -20,7 +20,7 @@ from btfkit.bench.cases import (
 )
 from btfkit.bench.cells import Cell, cells_of, refusal, run_cell, run_together, shared_cells
 from btfkit.bench.machine import machine
-from btfkit.errors import BtfkitError
+from btfkit.errors import BtfkitError, unknown
 from btfkit.files import whole
 from btfkit.fitting import MODELS
 from btfkit.io import queryfile
@@ -220,9 +220,9 @@ def _check(profile: Profile) -> None:
         ("model", profile.models, MODELS),
         ("material", profile.materials, CATALOGUE),
     ):
-        unknown = [name for name in given if name not in known]
-        if unknown:
-            raise ValueError(f"no {kind} {unknown[0]!r}; there are {', '.join(known)}")
+        for name in given:
+            if name not in known:
+                raise ValueError(unknown(kind, name, known))
     names = [name_of(source) for source in profile.sources]
     twice = [name for name in names if names.count(name) > 1]
     if twice:

@@ -59,6 +59,7 @@ def bench_verb(
     """
     from btfkit.bench.run import QUICK, Profile, ask, run
     from btfkit.bench.tables import brief
+    from btfkit.errors import meaning
     from btfkit.relief.procedural import CATALOGUE
 
     profile = QUICK if quick else Profile()
@@ -66,8 +67,10 @@ def bench_verb(
         stores = tuple(Path(name) for name in names if name not in CATALOGUE)
         for path in stores:
             if not path.exists():
+                meant = meaning(str(path), CATALOGUE)
                 raise ValueError(
-                    f"{path} is neither a file nor a material; there are {', '.join(CATALOGUE)}"
+                    f"{path} is neither a file nor a material{meant}; "
+                    f"there are {', '.join(CATALOGUE)}"
                 )
         profile = replace(
             profile, stores=stores, materials=tuple(name for name in names if name in CATALOGUE)
@@ -91,7 +94,8 @@ def bench_verb(
     found = run(profile, folder, progress=bar)
     files = [folder / name for name in FILES]
     line = f"{folder}: {len(found['cells'])} cells\n\n{brief(found['cells'])}"
-    return Outcome(line, {**found, "files": files})
+    then = f"open {folder / 'bench.md'}; a method of your own: --questions, then --answers"
+    return Outcome(line, {**found, "files": files}, then=then)
 
 
 FILES = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,7 +54,8 @@ def eval_verb(bar: Bar, *, model: Path, source: Path, everything: bool) -> Outco
     data: dict[str, Any] = {"model": model, "source": source, "which": which, **errors}
     if test is not None:
         data["held_out"] = test
-    return Outcome(f"{which}\n{line}", data)
+    then = f"btfkit render {shlex.quote(str(model))} --shape sphere"
+    return Outcome(f"{which}\n{line}", data, then=then)
 
 
 def _errors(material: Material, truth: BTF | QuerySet, rows: Any, bar: Bar) -> dict[str, Any]:

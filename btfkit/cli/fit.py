@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,7 +25,18 @@ if TYPE_CHECKING:
     from btfkit.fitting.report import FitReport
 
 
-@verb("fit", example="btfkit fit wool.btf.zarr --model neubtf --budget 10m")
+def _models() -> str:
+    """Every model with its settings and their defaults, for `--help`."""
+    from btfkit.fitting import MODELS, settings_of
+
+    lines = ["Models and their settings (--set key=value), with defaults:", "", "\b"]
+    for model in MODELS:
+        given = " ".join(f"{name}={value}" for name, value in settings_of(model).items())
+        lines += textwrap.wrap(f"{model}: {given or 'none'}", 76, subsequent_indent="    ")
+    return "\n".join(lines)
+
+
+@verb("fit", example="btfkit fit wool.btf.zarr --model neubtf --budget 10m", more=_models)
 @click.argument("source", required=False, type=click.Path(path_type=Path))
 @click.option("--model", default="auto", show_default=True, help="Name of a model, or auto.")
 @out_option("The model file; by default SOURCE.MODEL.safetensors here")
@@ -83,7 +95,10 @@ def fit_verb(
         raise ValueError(unknown("model", model, ["auto", *MODELS]))
     bar.phase("reading")
     path = source or the_only(
-        Path().glob("*.btf.zarr"), what="stores", remedy="name one: btfkit fit STORE"
+        Path().glob("*.btf.zarr"),
+        what="stores",
+        remedy="name one: btfkit fit STORE",
+        first="btfkit ingest FOLDER, or name a SOURCE",
     )
     report = fit(
         measured(path),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -72,7 +73,7 @@ def ingest_verb(
     btf = btfkit.open(path)
     n, h, w, c = btf.shape
     return Outcome(
-        f"{path}: {n} textures of {h} x {w} x {c}",
+        f"{path}: {n} textures of {w} x {h}, {c} channels",
         {
             "out": path,
             "shape": btf.shape,
@@ -80,4 +81,5 @@ def ingest_verb(
             "format": btf.provenance["format"],
             "assumed": btf.provenance.get("assumed", {}),
         },
+        then=f"btfkit fit {shlex.quote(str(path))}",
     )

@@ -56,12 +56,27 @@ class _Manners:
 _manners = _Manners()
 
 
-def verb(name: str, *, example: str) -> Callable[[Callable[..., Outcome]], click.Command]:
+@final
+class _Command(click.Command):
+    """A command whose help may end in what takes a moment to find out."""
+
+    more: Callable[[], str] | None = None
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        if self.more is not None:
+            self.epilog = self.more()
+        super().format_epilog(ctx, formatter)
+
+
+def verb(
+    name: str, *, example: str, more: Callable[[], str] | None = None
+) -> Callable[[Callable[..., Outcome]], click.Command]:
     """Make a verb of a function that takes a `Bar` and its options, and returns an `Outcome`.
 
     Args:
         name: the verb.
         example: command lines that `--help` shows.
+        more: what stands at its end, asked for when it is shown.
     """
 
     def decorate(function: Callable[..., Outcome]) -> click.Command:
@@ -80,7 +95,9 @@ def verb(name: str, *, example: str) -> Callable[[Callable[..., Outcome]], click
         ):
             call = option(call)
         help_text = inspect.cleandoc(function.__doc__ or "") + "\n\nExample:\n\n\b\n" + example
-        return click.command(name, help=help_text)(call)
+        command = click.command(name, cls=_Command, help=help_text)(call)
+        command.more = more
+        return command
 
     return decorate
 

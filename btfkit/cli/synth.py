@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any, final
 
@@ -130,4 +131,14 @@ def synth_verb(
             from btfkit.cli.convert import written
 
             written(btf, out, {"ubo2014": "btf"}.get(kind, kind), {}, force=force, progress=bar)
-    return Outcome(f"{out}: {name}, synthetic, as {kind}", {"out": out, "name": name, "as": kind})
+    line = f"{out}: {name}, synthetic, as {kind}"
+    data = {"out": out, "name": name, "as": kind}
+    return Outcome(line, data, then=_next(out, kind))
+
+
+def _next(out: Path, kind: str) -> str:
+    """What one does with a sample of its kind."""
+    path = shlex.quote(str(out))
+    if kind == "relief":
+        return f"btfkit render {path} --shape sphere"
+    return f"btfkit fit {path}" if kind in ("zarr", "queries") else f"btfkit ingest {path}"

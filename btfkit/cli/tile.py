@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -36,4 +37,15 @@ def tile_verb(bar: Bar, *, source: Path, out: Path | None, drift: bool, force: b
     return Outcome(
         line,
         {"out": final, **found.record(), "seam_ratio": found.seam_ratio},
+        then=_next(final),
     )
+
+
+def _next(final: Path) -> str:
+    """What one does with a tile of its kind."""
+    out = shlex.quote(str(final))
+    if final.suffix == ".zarr":
+        return f"btfkit fit {out}"
+    if final.suffix == ".safetensors":
+        return f"btfkit render {out} --shape sphere --repeat 3"
+    return f"btfkit propagate {out}"

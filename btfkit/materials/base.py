@@ -111,7 +111,7 @@ class Material(ABC):
         """Short: the model, its grid and its size."""
         h, w = self.header.grid
         size = sum(array.nbytes for array in self.weights.values() if hasattr(array, "nbytes"))
-        return f"{type(self).__name__}({h} x {w} texels, {len(self.header.channels)} channels, " + (
+        return f"{type(self).__name__}({w} x {h} texels, {len(self.header.channels)} channels, " + (
             f"{size / 1e6:.2f} MB)"
         )
 

@@ -460,7 +460,7 @@ def test_reports_and_materials_say_themselves_in_a_line() -> None:
     report = btfkit.fit(sample(), model="lambert")
     for value in (report, report.material, sample()):
         assert len(repr(value)) < 300
-    assert "40 x 16 x 16 x 3" in repr(sample())
+    assert "40 textures of 16 x 16, 3 channels" in repr(sample())
     assert "Lambert(16 x 16" in repr(report.material)
 
 
@@ -596,3 +596,171 @@ def test_a_chequerboard_that_tiles_has_no_seam(
     drawn(here / "board.png", board.astype(np.uint8))
     found = typed(capsys, "tile", "board.png")
     assert found["seam_ratio"] == pytest.approx(1)
+
+
+# --- small things
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("1m30s", 90), ("1h", 3600), ("1h2m3s", 3723), ("90", 90), ("0.5m", 30), ("1m 30s", 90)],
+)
+def test_a_time_may_be_said_in_parts(text: str, seconds: float) -> None:
+    from btfkit.cli.options import DurationType
+
+    assert DurationType().convert(text, None, None) == seconds
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["ingst", "x"], "no verb 'ingst' (did you mean ingest?); there are ingest, "),
+        (["fit", "wool.btf.zarr", "--model", "neubft"], "(did you mean neubtf?)"),
+        (["fit", "wool.btf.zarr", "--model", "pca", "--set", "rnk=3"], "(did you mean rank?)"),
+        (["fit", "wool.btf.zarr", "--bugdet", "3s"], "Did you mean one of: '--budget'"),
+        (["synth", "wovn", "-o", "x"], "no material 'wovn' (did you mean woven?)"),
+        (["render", "wool.btf.zarr", "--shape", "sphear"], "(did you mean sphere?)"),
+        (["ingest", "wool.btf.zarr", "-o", "x", "--format", "ubo203"], "(did you mean ubo2003?)"),
+        (["bench", "coblles"], "(did you mean cobbles?)"),
+    ],
+)
+def test_a_name_that_is_nearly_one_is_answered_with_it(
+    arguments: list[str], said: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(command, arguments) in (1, 2)
+    assert said in capsys.readouterr().err
+
+
+def test_help_of_fit_lists_models_with_their_settings(capsys: pytest.CaptureFixture[str]) -> None:
+    from btfkit.fitting import MODELS, SETTINGS, settings_of
+
+    assert set(SETTINGS) == set(MODELS)
+    assert run(command, ["fit", "--help"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    for model in MODELS:
+        assert f" {model}: " in said
+        for name, value in settings_of(model).items():
+            assert f"{name}={value}" in said
+
+
+def test_an_empty_folder_says_what_comes_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(command, ["fit"]) == 1
+    assert "first: btfkit ingest FOLDER" in capsys.readouterr().err
+    assert run(command, ["propagate", "a.png"]) == 1
+    assert "first: btfkit fit --model neubtf" in capsys.readouterr().err
+
+
+def test_a_folder_of_photographs_says_what_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a.png", "b.png"):
+        drawn(tmp_path / name, dotted())
+    assert run(command, ["ingest", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert "no reader knows this folder of 2 pictures: nothing says where light and view" in said
+    assert "manifest.csv" in said
+    assert ".lp" in said
+
+
+def test_sizes_are_width_by_height_where_people_read_them(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    writer.write(sample().crop(slice(0, 8), slice(0, 16)), here / "wide.btf.zarr")
+    assert run(command, ["ingest", "wide.btf.zarr", "-o", "w.btf.zarr"]) == 0
+    assert "40 textures of 16 x 8, 3 channels" in capsys.readouterr().out
+    assert "40 textures of 16 x 8" in repr(btfkit.open(here / "wide.btf.zarr"))
+    assert "(16 x 8 texels" in repr(
+        fit(btfkit.open(here / "wide.btf.zarr"), model="lambert").material
+    )
+
+
+@pytest.mark.parametrize(("more", "size"), [((), (512, 256)), (("--size", "40x30"), (40, 30))])
+def test_a_wide_material_makes_a_wide_picture(
+    more: tuple[str, ...], size: tuple[int, int], here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from skimage.io import imread
+
+    wide = sample().crop(slice(0, 8), slice(0, 16))
+    file.save(fit(wide, model="lambert").material, here / "wide.safetensors")
+    assert run(command, ["render", "wide.safetensors", "-o", "x.jpg", *more]) == 0
+    assert imread(here / "x.jpg").shape == (size[1], size[0], 3)
+    assert (here / "x.jpg").read_bytes()[:2] == b"\xff\xd8"
+
+
+def test_a_query_file_is_answered_beside_it_by_default(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    up = np.tile(np.float32([0, 0, 1]), (5, 1))
+    queryfile.write(QuerySet(np.full((5, 2), 0.5), up, up), here / "ask.npz")
+    found = typed(capsys, "query", "wool.btf.zarr", "ask.npz")
+    assert found["out"] == "ask.answers.npz"
+    assert queryfile.read(here / "ask.answers.npz").rgb is not None
+
+
+def test_auto_names_the_model_that_it_took(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    writer.write(sample(9), here / "nine.btf.zarr")
+    assert run(command, ["fit", "nine.btf.zarr"]) == 0
+    assert capsys.readouterr().out.startswith("nine.auto.safetensors: interpolation, held-out")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "then"),
+    [
+        (["ingest", "wool.btf.zarr", "-o", "b.btf.zarr"], "btfkit fit b.btf.zarr"),
+        (["fit", "--model", "lambert"], "btfkit render wool.lambert.safetensors --shape sphere"),
+        (["convert", "wool.btf.zarr", "-o", "u", "--as", "manifest"], "btfkit info u"),
+        (["synth", "print", "-o", "p.exr", "--as", "relief", "--size", "8"],
+         "btfkit render p.exr --shape sphere"),
+        (["tile", "wool.btf.zarr"], "btfkit fit wool.tile.btf.zarr"),
+        (["eval", "wool.btf.zarr", "wool.btf.zarr"], "btfkit render wool.btf.zarr --shape sphere"),
+        (["render", "wool.btf.zarr", "--size", "8x8"], "open it; --env"),
+    ],
+)  # fmt: skip
+def test_every_verb_says_what_one_may_do_next(
+    arguments: list[str], then: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(command, arguments) == 0
+    caught = capsys.readouterr()
+    assert f"next: {then}" in caught.err
+    assert "next:" not in caught.out
+    assert run(command, [*arguments, *(() if arguments[0] == "eval" else ("--force",)),
+                         "--quiet"]) == 0  # fmt: skip
+    assert "next:" not in capsys.readouterr().err
+
+
+def test_guidance_that_is_clear_in_places_says_what_becomes_of_them() -> None:
+    from btfkit import propagation
+
+    rng = np.random.default_rng(0)
+    image = rng.random((16, 16, 4)).astype(np.float32)
+    image[..., 3] = 1
+    image[:4, :, 3] = 0
+    image[:4, :, :3] = 9  # whatever lies there must not guide anything
+    with pytest.warns(UserWarning, match="no opacity: 64 texels that are clear throughout"):
+        given = propagation.prepare(image)
+    mean = image[4:, :, :3].mean(axis=(0, 1))
+    filled = image[..., :3].copy()
+    filled[:4] = mean
+    np.testing.assert_allclose(given, propagation.prepare(filled), atol=1e-6)
+
+
+def test_alpha_of_a_picture_is_seen(tmp_path: Path) -> None:
+    from btfkit import propagation
+
+    codes = np.full((8, 8, 4), 200, np.uint8)
+    codes[..., 3] = 255
+    drawn(tmp_path / "opaque.png", codes)
+    assert propagation._image(tmp_path / "opaque.png")[0].shape == (8, 8, 3)
+    codes[2, 3, 3] = 0
+    drawn(tmp_path / "clear.png", codes)
+    alpha = propagation._image(tmp_path / "clear.png")[0][..., 3]
+    assert (alpha == 0).sum() == 1
+    assert alpha[2, 3] == 0
+
+
+def test_the_readme_says_where_the_command_is_after_make() -> None:
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    assert ".venv/bin/activate" in text

@@ -487,7 +487,7 @@ def test_guidance_that_no_image_is_is_refused(
 
 def test_alpha_and_texels_that_are_not_finite_are_left_out_with_a_warning(fitted: Path) -> None:
     guidance = np.random.default_rng(0).random((16, 16, 4)).astype(np.float32)
-    with pytest.warns(UserWarning, match="4 channels; the last is taken for alpha"):
+    with pytest.warns(UserWarning, match="the guidance has alpha"):
         propagation.propagate(guidance, fitted)
     guidance[3, 4] = np.nan
     with pytest.warns(UserWarning, match="1 guidance texels are not finite"):
