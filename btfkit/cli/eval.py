@@ -49,7 +49,7 @@ def eval_verb(bar: Bar, *, model: Path, source: Path, everything: bool) -> Outco
     rows = None if everything or test is None else test
     bar.phase("evaluating")
     errors = _errors(material, truth, rows, bar)
-    which = _which(len(truth), rows, test)
+    which = _which(material, truth, rows, test)
     line = "  ".join(f"{k} {v:.6g}" for k, v in errors.items() if isinstance(v, (int, float)))
     data: dict[str, Any] = {"model": model, "source": source, "which": which, **errors}
     if test is not None:
@@ -67,9 +67,15 @@ def _errors(material: Material, truth: BTF | QuerySet, rows: Any, bar: Bar) -> d
     return evaluation.errors_on_queries(material, truth if rows is None else truth.subset(rows))
 
 
-def _which(count: int, rows: Any, test: Any) -> str:
+def _which(material: Material, truth: BTF | QuerySet, rows: Any, test: Any) -> str:
     """What was compared, in words."""
+    count, known = len(truth), material.header.provenance
     if test is None:
+        if "fingerprint" not in known:
+            return f"all {count}: the model does not say what it was fitted to"
+        origin = known.get("data", {}).get("hash")
+        if origin and origin == truth.provenance.get("hash"):
+            return f"all {count}: another part of the source of the fit, perhaps trained on"
         return f"all {count}: not the data of the fit"
     if rows is None:
         return f"all {count}, {count - len(test)} of them trained on"

@@ -95,6 +95,9 @@ def fit(
         material, run = _solved(data.subset(train), chosen, given, plan, progress)
     else:
         material, run = _trained(data, chosen, given, plan, phases, progress)
+    if phases.late():
+        said = f"starting took {phases.seconds['starting']:.0f} s of a budget of {budget_s:g} s"
+        choice = (*choice, f"{said}: training had its least share, and ended late")
     if _cpu_alone(chosen, run.device, device):
         choice = (*choice, f"trained on the CPU: {chosen} cannot use a GPU")
     provenance = _provenance(data, plan, given, run)

@@ -68,6 +68,12 @@ class Phases:
         rest = left - min(self.evaluating_s() or 0.0, self._budget_s / 2)
         return max(rest, _LEAST_TRAINING * self._budget_s)
 
+    def late(self) -> bool:
+        """Whether starting took so long that training had its least share, beyond the budget."""
+        if self._budget_s is None:
+            return False
+        return self.seconds.get("starting", 0.0) > (1 - _LEAST_TRAINING) * self._budget_s
+
     def evaluating_s(self) -> float | None:
         """What an evaluation may take: a tenth of the budget, at least 2 s; None for no limit."""
         if self._budget_s is None:

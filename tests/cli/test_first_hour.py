@@ -96,6 +96,16 @@ def test_eval_takes_all_of_other_data(here: Path, capsys: pytest.CaptureFixture[
     assert "held_out" not in found
 
 
+def test_eval_says_when_pairs_may_have_been_trained_on(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    typed(capsys, "ingest", "wool.btf.zarr", "-o", "whole.btf.zarr")
+    typed(capsys, "ingest", "wool.btf.zarr", "-o", "part.btf.zarr", "--lights", "0:20")
+    typed(capsys, "fit", "whole.btf.zarr", "--model", "lambert")
+    found = typed(capsys, "eval", "whole.lambert.safetensors", "part.btf.zarr")
+    assert found["which"] == "all 20: another part of the source of the fit, perhaps trained on"
+
+
 def test_eval_of_a_fit_that_held_nothing_out_asks_for_all(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -165,6 +175,14 @@ def test_a_budget_is_shared_by_its_parts(monkeypatch: pytest.MonkeyPatch) -> Non
     assert told == [("reading", None), ("starting", 60), ("training", 56), ("writing", 6),
                     ("evaluating", 5)]  # fmt: skip
     assert phases.seconds == {"reading": 7, "starting": 4, "training": 50, "writing": 1}
+    assert not phases.late()
+    hurried = parts.Phases(4.0, None)
+    for name in ("reading", "starting", "training"):
+        hurried.begin(name)
+        now[0] += 5
+    # Whatever starting takes, something is trained; the report says that it ended late.
+    assert hurried.training_s() == 1
+    assert hurried.late()
     # At least 2 s of a short budget, and none without one.
     assert parts.Phases(5.0, None).evaluating_s() == 2
     assert parts.Phases(None, None).evaluating_s() is None

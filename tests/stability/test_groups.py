@@ -29,8 +29,7 @@ from btfkit import directions, propagation
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.fitting import fit
-from btfkit.fitting.neubtf import augment
-from btfkit.fitting.neubtf import trainable as neubtf
+from btfkit.fitting.neubtf import augment, trainable
 from btfkit.footprint import level_sizes
 from btfkit.io import anglenames, images, queryfile
 from btfkit.io.anglenames import Angles
@@ -254,7 +253,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "m.safetensors"
     with pytest.MonkeyPatch.context() as patch:
         # What two steps carry is of no account here.
-        patch.setattr(neubtf, "_LEAST_TAUGHT", 1)
+        patch.setattr(trainable, "_LEAST_TAUGHT", 1)
         fit.fit(sources.small_btf(), model="neubtf", steps=2, holdout=0.0, out=path)
     return path
 
