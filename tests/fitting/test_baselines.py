@@ -24,10 +24,10 @@ from btfkit.errors import FitError
 from btfkit.fitting import loop
 from btfkit.fitting.factorisation import EncodedRows, factorised
 from btfkit.fitting.fit import fit
-from btfkit.heldout import split
 from btfkit.fitting.lambert import lambert
 from btfkit.fitting.rainer import trainable as rainer
 from btfkit.fitting.rainer.networks import Decoder, SetEncoder
+from btfkit.heldout import split
 from btfkit.io.store.writer import write
 from btfkit.materials.bilinear import corners, lookup
 from btfkit.materials.evaluation import answer_pair, errors_on_btf

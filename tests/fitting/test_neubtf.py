@@ -262,9 +262,7 @@ def test_a_resumed_fit_takes_the_same_trajectory(
     assert part.is_file()
     assert report.steps == 17
     monkeypatch.setattr(neubtf.NeuBTF, "step", original)
-    report = fit.fit(
-        tiny, model="neubtf", steps=30, out=part, settings=TINY, resume=True
-    )
+    report = fit.fit(tiny, model="neubtf", steps=30, out=part, settings=TINY, resume=True)
     assert (report.steps, report.interrupted) == (30, False)
     for name, array in btfkit.load(whole).weights.items():
         np.testing.assert_array_equal(array, btfkit.load(part).weights[name])
