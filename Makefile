@@ -33,7 +33,8 @@ $(STAMP): pyproject.toml constraints.txt CMakeLists.txt btfkit/conventions.py $(
 	@command -v c++ >/dev/null || command -v g++ >/dev/null || command -v clang++ >/dev/null || \
 	  echo "no C++ compiler: btfkit runs on its plain twins, correct but slower; apt-get install g++ for the kernels"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	@echo "installing btfkit and what it needs into $(VENV): a few minutes, about 1.5 GB"
+	$(BIN)/python -m pip install --progress-bar on --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	touch $@
 
 clean:

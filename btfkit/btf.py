@@ -100,6 +100,13 @@ class BTF:
     def __len__(self) -> int:
         return self.shape[0]
 
+    def __repr__(self) -> str:
+        """Short: sizes, and where it comes from."""
+        n, h, w, c = self.shape
+        source = self.provenance.get("source", self.provenance.get("made", "memory"))
+        said = f"{n} textures of {w} x {h}, {c} channels, {self.wrap}"
+        return f"BTF({said}, of {str(source)[:80]})"
+
     def texture(self, index: int) -> NDArray[np.float32]:
         """(h, w, c) texture of pair `index`, linear; NaN where it is not valid."""
         image = self.textures[index]
@@ -127,7 +134,11 @@ class BTF:
         return np.where(valid[..., None], values, np.float32(np.nan))
 
     def abrdf(self, row: int, col: int) -> NDArray[np.float32]:
-        """(n, c) apparent BRDF of one texel: its value under every pair."""
+        """(n, c) apparent BRDF of one texel: its value under every pair.
+
+        That reads every texture once. A store then keeps a band of rows of all of them at hand, so
+        that texels nearby cost nothing; of other sources ask for several at once by `texels`.
+        """
         pairs = np.arange(len(self))
         return self.texels(pairs, np.full_like(pairs, row), np.full_like(pairs, col))
 

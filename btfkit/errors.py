@@ -12,6 +12,7 @@ Wrong arguments are ValueError and TypeError, as everywhere in Python.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 
 
 class BtfkitError(Exception):
@@ -56,3 +57,17 @@ class CalibrationError(BtfkitError):
 
 class FitError(BtfkitError):
     """A model cannot be fitted: no usable data, or training that diverges."""
+
+
+def unknown(kind: str, name: str, known: Iterable[str]) -> str:
+    """The message for a name that there is not: what it may have meant, and what there is."""
+    names = list(known)
+    return f"no {kind} {name!r}{meaning(name, names)}; there are {', '.join(names)}"
+
+
+def meaning(name: str, known: Iterable[str]) -> str:
+    """` (did you mean ...?)` where a known name is close; empty where none is."""
+    import difflib
+
+    close = difflib.get_close_matches(name.lower(), list(known), n=1, cutoff=0.6)
+    return f" (did you mean {close[0]}?)" if close else ""

@@ -2,22 +2,55 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+# What must fit into a folder before anybody works for hours on what shall lie there.
+_LEAST_ROOM = 1 << 20
 
 
 def refuse_existing(path: str | os.PathLike[str], *, force: bool) -> Path:
-    """`path` as a Path; FileExistsError where it exists and `force` is False."""
+    """`path` as a Path, once it is sure that something can be written there.
+
+    Raises:
+        FileExistsError: it exists and `force` is False.
+        FileNotFoundError: its folder is missing.
+        OSError: nothing can be written into its folder, or the disk is full; names `path`.
+    """
     final = Path(path)
     if final.exists() and not force:
         raise FileExistsError(f"{final} exists; --force (force=True) replaces it")
     if not final.parent.is_dir():
         raise FileNotFoundError(f"{final.parent} is not a folder; create it first")
+    probe = final.with_name(f".{secrets.token_hex(8)}.probe")
+    try:
+        probe.write_bytes(bytes(_LEAST_ROOM))
+    except OSError as error:
+        raise named(error, final) from error
+    finally:
+        with suppress(OSError):
+            probe.unlink(missing_ok=True)
     return final
+
+
+def room_for(path: Path, size: float, *, what: str) -> None:
+    """OSError (ENOSPC) where the disk of `path` has not `size` bytes for `what`."""
+    free = shutil.disk_usage(path.parent).free
+    if free < size:
+        said = f"{os.strerror(errno.ENOSPC)}: {what} takes {size / 1e6:.0f} MB"
+        raise OSError(errno.ENOSPC, f"{said}, and {free / 1e6:.0f} MB are free", os.fspath(path))
+
+
+def named(error: OSError, path: Path) -> OSError:
+    """The same error, with `path` as the file that it is about."""
+    if error.errno is None:
+        return error
+    return OSError(error.errno, error.strerror, os.fspath(path))
 
 
 @contextmanager
@@ -38,6 +71,11 @@ def whole(path: str | os.PathLike[str], *, force: bool = False) -> Iterator[Path
         with partial.open("rb+") as file:
             os.fsync(file.fileno())
         partial.replace(final)
+    except OSError as error:
+        # A write that fails names no file, and nobody knows the partial one.
+        if error.filename in (None, os.fspath(partial)):
+            raise named(error, final) from error
+        raise
     finally:
         partial.unlink(missing_ok=True)
 

@@ -65,6 +65,7 @@ def ingest(
     jobs: int | None = None,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
+    phase: Callable[[str], None] | None = None,
 ) -> Path:
     """Read a source in any known format and write a native store.
 
@@ -75,6 +76,8 @@ def ingest(
         options: what the format leaves open, as its reader names it; None values are left out.
         part: which part is read.
         dtype, jobs, force, progress: as in `io.store.writer.write`.
+        phase: called with the name of each part as it begins: opening, hashing, reading and
+            writing (each texture is decoded once and written at once).
 
     Returns:
         The path of the store.
@@ -84,12 +87,15 @@ def ingest(
         FileExistsError: `out` exists and `force` is False.
     """
     final = refuse_existing(out if out is not None else store_name(source), force=force)
+    told = phase or (lambda name: None)
+    told("opening")
     name = format or io.detect(source)
     given = {key: value for key, value in (options or {}).items() if value is not None}
     settled = {"texel_mm": given.pop("texel_mm")} if _outside(name, given, "texel_mm") else {}
     btf = replace(io.open(source, format=name, **given), **settled)
     taken = part or Part()
     btf = taken.of(btf)
+    told("hashing")
     provenance = {
         **btf.provenance,
         "source": os.fspath(source),
@@ -103,6 +109,7 @@ def ingest(
     }
     history = (*btf.history, f"ingested from {name}")
     record = replace(btf, provenance=provenance, history=history)
+    told("reading and writing")
     path = writer.write(record, final, dtype=dtype, jobs=jobs, force=force, progress=progress)
     masked = store.masked_texels(path)
     if masked:

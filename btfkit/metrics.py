@@ -149,20 +149,26 @@ def iou(answer: Array, truth: Array) -> float:
     return 1.0 if union == 0 else float(np.logical_and(a, t).sum() / union)
 
 
-def seam_ratio(image: Array) -> float:
+def seam_ratio(image: Array, *, period: tuple[int, int] = (0, 0)) -> float:
     """Mean |step| across the seams of a tiled picture over that inside; near 1 where it tiles.
 
     Args:
         image: (h, w, c) one tile; steps to NaN do not count.
+        period: rows and columns after which it repeats; where it does so within itself, the seams
+            are compared with the steps whole periods away. 0 where nothing repeats.
     """
     ratios = []
     for axis in (0, 1):
         x = np.moveaxis(np.asarray(image, np.float64), axis, 0)
         if len(x) < 2:
             continue
+        steps = np.abs(np.diff(x, axis=0))
+        repeats = round(len(x) / period[axis]) if period[axis] else 1
+        if repeats > 1:
+            steps = steps[np.rint(np.arange(1, repeats) * len(x) / repeats).astype(int) - 1]
         across, inside = (
             float(step[np.isfinite(step)].mean()) if np.isfinite(step).any() else 0.0
-            for step in (np.abs(x[0] - x[-1]), np.abs(np.diff(x, axis=0)))
+            for step in (np.abs(x[0] - x[-1]), steps)
         )
         ratios.append(1.0 if across == inside == 0 else across / max(inside, 1e-12))
     return float(np.mean(ratios)) if ratios else 1.0

@@ -50,8 +50,8 @@ def propagate(
     """The NeuBTF of `model` on another structure.
 
     Args:
-        guidance: an image file, or (h, w, c) linear values in 0..1; grey is repeated, alpha
-            left out with a warning.
+        guidance: an image file, or (h, w, c) linear values in 0..1; grey is repeated. A NeuBTF has
+            no opacity: where alpha is 0 the mean colour is taken, with a warning.
         model: a NeuBTF file with its encoder.
         scale: the guidance is resized by this first; within the scales of the training (a quarter
             to one, unless it was set otherwise) the material scales with it.
@@ -62,7 +62,7 @@ def propagate(
         progress: called with (stages done, stages).
 
     Raises:
-        FitError: the model has no encoder.
+        FitError: the model has no encoder, or one that was never trained.
         FormatError: the guidance or the model cannot be read.
         ValueError: a guidance with no size, too large, or with channels that no image has.
     """
@@ -71,6 +71,8 @@ def propagate(
     image, name = _image(guidance)
     if progress:
         progress(1, 4)
+    if image.ndim == 3 and image.shape[2] in (2, 4):
+        image = _opaque(image)
     if tileable:
         from btfkit.synthesis import make_tileable
 
@@ -135,10 +137,7 @@ def prepare(image: Array, *, scale: float = 1.0, wrap: bool = False) -> torch.Te
         raise ValueError(f"guidance has shape {image.shape}; expected (h, w, c)")
     h, w, c = image.shape
     if c in (2, 4):
-        warnings.warn(
-            f"the guidance has {c} channels; the last is taken for alpha and left out", stacklevel=3
-        )
-        image = image[..., : c - 1]
+        image = _opaque(image)
     elif c not in (1, 3):
         raise ValueError(f"guidance has {c} channels; expected 1 (grey) or 3 (RGB)")
     if not 0 < scale < 1e3:
@@ -214,6 +213,7 @@ def _fitted(
             f"{os.fspath(path)} has no encoder (a propagated NeuBTF has none)",
             remedy="name the model that was fitted",
         )
+    _check_trained(path, material)
     encoder = Encoder(material.spec.latents, torch.Generator())
     try:
         encoder.load_state_dict(weights)
@@ -223,10 +223,56 @@ def _fitted(
     return material, encoder.eval(), mean, deviation
 
 
+def _check_trained(path: str | os.PathLike[str], material: NeuBTF) -> None:
+    """Refuse an encoder that was never trained, warn of one that hardly was."""
+    parts = [str(part) for part in material.header.provenance.get("untrained", ())]
+    encoder = next((part for part in parts if part.startswith("the encoder")), None)
+    if encoder is None:
+        return
+    if "not begun" in encoder:
+        raise FitError(
+            f"{os.fspath(path)} is of a fit that ended early: {encoder}",
+            remedy="go on with it: btfkit fit --model neubtf --resume, or fit anew for longer",
+        )
+    warnings.warn(f"{os.fspath(path)} is of a fit that ended early: {encoder}", stacklevel=4)
+
+
 def _image(guidance: str | os.PathLike[str] | Array) -> tuple[Array, Any]:
     if isinstance(guidance, np.ndarray):
         return guidance.astype(np.float32), "an array"
     path = Path(guidance)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image")
-    return images.read(path.name, path.read_bytes(), transfer="srgb"), str(path)
+    data = path.read_bytes()
+    image = images.read(path.name, data, transfer="srgb")
+    alpha = _alpha(path, data)
+    if alpha is not None and image.shape[2] in (1, 3):
+        image = np.concatenate([image, alpha[..., None]], axis=2)
+    return image, str(path)
+
+
+def _alpha(path: Path, data: bytes) -> Array | None:
+    """(h, w) alpha of a picture of integer codes, 0..1; None where it has none, or all is 1."""
+    if path.suffix.lower() not in (".png", ".tif", ".tiff"):
+        return None
+    import cv2
+
+    codes: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if codes is None or codes.ndim != 3 or codes.shape[2] != 4 or codes.dtype.kind != "u":
+        return None
+    alpha = codes[..., 3] / np.float32(np.iinfo(codes.dtype).max)
+    return None if (alpha == 1).all() else alpha.astype(np.float32)
+
+
+def _opaque(image: Array) -> Array:
+    """(h, w, 1 or 3) colours of an image whose last channel is alpha."""
+    colours, clear = image[..., :-1], ~(image[..., -1] > 0)
+    warnings.warn(
+        f"the guidance has alpha, and a NeuBTF no opacity: {int(clear.sum())} texels that are "
+        f"clear throughout take the mean colour, the others are taken for opaque",
+        stacklevel=3,
+    )
+    if clear.all():
+        return colours
+    mean = colours[~clear].mean(axis=0)
+    return np.where(clear[..., None], mean, colours).astype(np.float32)

@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
+from btfkit.errors import meaning
+
 T = TypeVar("T")
 
 _TRUE, _FALSE = ("1", "true", "on", "yes"), ("0", "false", "off", "no")
@@ -28,6 +30,11 @@ def split(text: str) -> tuple[str, str]:
     return key, value
 
 
+def as_text(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Settings as `--set` would say them, from text, numbers and booleans."""
+    return {name: str(value) for name, value in settings.items()}
+
+
 def parsed(kind: type[T], model: str, given: Mapping[str, str]) -> T:
     """A frozen dataclass of settings from text; each value has the type of its field.
 
@@ -38,7 +45,8 @@ def parsed(kind: type[T], model: str, given: Mapping[str, str]) -> T:
     unknown = sorted(given.keys() - set(names))
     if unknown:
         known = ", ".join(names) or "none"
-        raise ValueError(f"{model} has no setting {', '.join(unknown)}; it has {known}")
+        meant = "".join(meaning(name, names) for name in unknown)
+        raise ValueError(f"{model} has no setting {', '.join(unknown)}{meant}; it has {known}")
     return kind(**_values(get_type_hints(kind), given))
 
 
@@ -52,7 +60,10 @@ def options_of(function: Callable[..., Any], given: Mapping[str, str]) -> dict[s
     names = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in _COMMON]
     unknown = sorted(given.keys() - set(names))
     if unknown:
-        raise ValueError(f"no setting {', '.join(unknown)}; there are {', '.join(names) or 'none'}")
+        meant = "".join(meaning(name, names) for name in unknown)
+        raise ValueError(
+            f"no setting {', '.join(unknown)}{meant}; there are {', '.join(names) or 'none'}"
+        )
     return _values(get_type_hints(function), given)
 
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from btfkit import io, sources
 from btfkit.btf import BTF
-from btfkit.fitting.fit import split
 from btfkit.footprint import blur_of, blurred, gaussian, most_levels, of_level
+from btfkit.heldout import split
 from btfkit.io import queryfile
 from btfkit.materials.evaluation import texel_centres
 from btfkit.queries import QuerySet

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, final
 
-from btfkit.bench import kernels, plots, tables, targets
+from btfkit.bench import answers, kernels, plots, tables
 from btfkit.bench.cases import (
     Case,
     asked,
@@ -20,9 +20,10 @@ from btfkit.bench.cases import (
 )
 from btfkit.bench.cells import Cell, cells_of, refusal, run_cell, run_together, shared_cells
 from btfkit.bench.machine import machine
-from btfkit.errors import BtfkitError
+from btfkit.errors import BtfkitError, unknown
 from btfkit.files import whole
 from btfkit.fitting import MODELS
+from btfkit.io import queryfile
 from btfkit.jsonvalues import plain
 from btfkit.native.neural import available
 
@@ -39,12 +40,14 @@ class Profile:
         models: by name. budgets_cpu_s: of every trained model, ascending.
         size: texels a side. directions: lights, and views, of the traced materials.
         holdout: share of the pairs of stores, and of the rows of query files, that are held out.
+        answers: (name, query file) of methods from elsewhere, answered questions.
         seed: of data and models. kernel_seconds: a figure of the kernel tables; 0 for none.
     """
 
     materials: tuple[str, ...] = ("cobbles", "woven", "scratched", "print")
     stores: tuple[Path, ...] = ()
     models: tuple[str, ...] = tuple(MODELS)
+    answers: tuple[tuple[str, Path], ...] = ()
     budgets_cpu_s: tuple[float, ...] = (5.0, 15.0, 60.0)
     size: int = 128
     directions: int = 21
@@ -76,7 +79,7 @@ def run(profile: Profile, folder: Path, *, progress: Progress | None = None) -> 
         progress: called with (cells done, cells).
 
     Returns:
-        What bench.json holds: machine, profile, cells, tables, targets.
+        What bench.json holds: machine, profile, cells, tables of kernels.
 
     Raises:
         ValueError: an unknown model or material, or two materials of one name.
@@ -86,6 +89,7 @@ def run(profile: Profile, folder: Path, *, progress: Progress | None = None) -> 
     folder.mkdir(parents=True, exist_ok=True)
     _claim(folder, profile)
     _run_missing(profile, folder, progress)
+    _score(profile, folder)
     further = {
         "machine": machine(),
         "profile": json.loads(json.dumps(asdict(profile), default=str)),
@@ -96,9 +100,39 @@ def run(profile: Profile, folder: Path, *, progress: Progress | None = None) -> 
     # Another process may have finished cells meanwhile; the last to write has seen them all.
     while rows != (now := cells_in(folder, profile)):
         rows = now
-        results = {**further, "cells": rows, "targets": targets.targets(rows)}
+        results = {**further, "cells": rows}
         _report(folder, results)
     return results
+
+
+def ask(profile: Profile, folder: Path) -> list[Path]:
+    """Write the questions of every material, `questions/NAME.npz`, for methods from elsewhere.
+
+    Raises:
+        ValueError: an unknown material. BtfkitError: `folder` holds cells of another profile.
+    """
+    _check(profile)
+    (folder / "questions").mkdir(parents=True, exist_ok=True)
+    _claim(folder, profile)
+    written = []
+    for source in profile.sources:
+        path = folder / "questions" / f"{name_of(source)}.npz"
+        queryfile.write(answers.questions(_case(source, profile)), path, force=True)
+        written.append(path)
+    return written
+
+
+def _score(profile: Profile, folder: Path) -> None:
+    """A cell for every file of answers, beside those of the models."""
+    if not profile.answers:
+        return
+    cases = [_case(source, profile) for source in profile.sources]
+    for name, path in profile.answers:
+        given = answers.read(path)
+        case = answers.case_of(path, given, cases)
+        key = f"{case.name}_{name}".replace(" ", "_").replace("/", "_")
+        row = {**answers.scored(name, given, case), "seed": profile.seed, "answers": path.name}
+        _write(folder / "cells" / f"{key}.json", {**row, "case": case.describe()})
 
 
 def _report(folder: Path, results: Mapping[str, Any]) -> None:
@@ -110,8 +144,13 @@ def _report(folder: Path, results: Mapping[str, Any]) -> None:
     ):
         with whole(folder / name, force=True) as partial:
             draw(good, partial)
-    with whole(folder / "bench.md", force=True) as partial:
-        partial.write_text(tables.markdown(results))
+    for name, told in (
+        ("bench.md", tables.markdown(results)),
+        ("bench.csv", tables.csv_of(results["cells"])),
+        ("bench.tex", tables.latex(results["cells"])),
+    ):
+        with whole(folder / name, force=True) as partial:
+            partial.write_text(told, encoding="utf-8")
     _write(folder / "bench.json", results)
 
 
@@ -181,9 +220,9 @@ def _check(profile: Profile) -> None:
         ("model", profile.models, MODELS),
         ("material", profile.materials, CATALOGUE),
     ):
-        unknown = [name for name in given if name not in known]
-        if unknown:
-            raise ValueError(f"no {kind} {unknown[0]!r}; there are {', '.join(known)}")
+        for name in given:
+            if name not in known:
+                raise ValueError(unknown(kind, name, known))
     names = [name_of(source) for source in profile.sources]
     twice = [name for name in names if names.count(name) > 1]
     if twice:

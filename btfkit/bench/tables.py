@@ -2,12 +2,32 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from btfkit.bench.machine import same
 
 Row = Mapping[str, Any]
+# Columns of a table of cells: title, key, how it is written, and its unit as a factor.
+_COLUMNS: tuple[tuple[str, str, str, float], ...] = (
+    ("CPU s", "cpu_seconds", "{:.1f}", 1),
+    ("wall s", "seconds", "{:.1f}", 1),
+    ("steps", "steps", "{:.0f}", 1),
+    ("log1p dB", "psnr_log1p", "{:.2f}", 1),
+    ("dB", "psnr", "{:.2f}", 1),
+    ("sRGB dB", "psnr_srgb", "{:.2f}", 1),
+    ("SSIM", "ssim_srgb", "{:.3f}", 1),
+    ("FLIP", "flip", "{:.3f}", 1),
+    ("weights", "parameters", "{:.0f}", 1),
+    ("kB", "bytes", "{:.0f}", 1e-3),
+    ("Mquery/CPU s", "queries_per_cpu_s", "{:.2f}", 1e-6),
+    ("% peak", "share_of_peak", "{:.0f}", 100),
+    ("MB more", "peak_memory_bytes", "{:.0f}", 1e-6),
+)
+# What a paper's table has of them.
+_PRINTED = ("CPU s", "log1p dB", "dB", "SSIM", "FLIP", "kB")
 
 
 def markdown(results: Mapping[str, Any]) -> str:
@@ -38,7 +58,6 @@ def markdown(results: Mapping[str, Any]) -> str:
     ):
         if key in results:
             parts += [f"## {title}\n", generic(results[key])]
-    parts += ["## Targets\n", generic(results["targets"])]
     return "\n".join(part for part in parts if part) + "\n"
 
 
@@ -47,6 +66,8 @@ def others(rows: Sequence[Row], machine: Row) -> str:
     kinds: dict[str, int] = {}
     for row in rows:
         place = row.get("machine")
+        if row.get("elsewhere"):
+            continue
         if place is None:
             kind = "an unnamed machine"
         elif same(place, machine):
@@ -62,27 +83,73 @@ def others(rows: Sequence[Row], machine: Row) -> str:
 
 def cells(rows: Sequence[Row]) -> str:
     """One line a cell."""
-    names = (
-        "model", "CPU s", "wall s", "steps", "log1p dB", "dB", "sRGB dB", "SSIM", "FLIP",
-        "weights", "kB", "Mquery/CPU s", "% peak", "MB more",
-    )  # fmt: skip
+    names = ("model", *(title for title, *_ in _COLUMNS))
     lines = []
     for row in rows:
         if "failed" in row:
             lines.append([row["label"], row["failed"][:80], *[""] * (len(names) - 2)])
             continue
-        lines.append(
-            [
-                row["label"], _in("{:.1f}", row["cpu_seconds"]), _in("{:.1f}", row["seconds"]),
-                row["steps"], _in("{:.2f}", row["psnr_log1p"]), _in("{:.2f}", row["psnr"]),
-                _in("{:.2f}", row.get("psnr_srgb")), _in("{:.3f}", row.get("ssim_srgb")),
-                _in("{:.3f}", row.get("flip")), row["parameters"],
-                _in("{:.0f}", row["bytes"], 1e-3), _in("{:.2f}", row["queries_per_cpu_s"], 1e-6),
-                _in("{:.0f}", row["share_of_peak"], 100),
-                _in("{:.0f}", row["peak_memory_bytes"], 1e-6),
-            ]
-        )  # fmt: skip
+        lines.append([row["label"], *(_in(form, row.get(key), times) for _, key, form, times
+                                      in _COLUMNS)])  # fmt: skip
     return _table(names, lines)
+
+
+def brief(rows: Sequence[Row]) -> str:
+    """A line a cell, for the end of a run: material, model, time and errors."""
+    columns = [column for column in _COLUMNS if column[0] in _PRINTED]
+    lines = [
+        [row["material"], row["label"], *(_in(form, row.get(key), times) for _, key, form, times
+                                          in columns)]
+        for row in rows
+    ]  # fmt: skip
+    return _table(("material", "model", *(title for title, *_ in columns)), lines)
+
+
+def csv_of(rows: Sequence[Row]) -> str:
+    """Every number of every cell, a line a cell, by the keys of bench.json."""
+    scalars = [
+        {key: value for key, value in row.items() if not isinstance(value, (dict, list))}
+        for row in rows
+    ]
+    keys = list(dict.fromkeys(key for row in scalars for key in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, keys, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(scalars)
+    return text.getvalue()
+
+
+def latex(rows: Sequence[Row]) -> str:
+    """A tabular a material, as papers print them (booktabs); best values in bold."""
+    columns = [column for column in _COLUMNS if column[0] in _PRINTED]
+    head = " & ".join(["method", *(_escaped(title) for title, *_ in columns)])
+    parts = []
+    for material in dict.fromkeys(row["material"] for row in rows):
+        here = [row for row in rows if row["material"] == material and "failed" not in row]
+        lines = [f"% {_escaped(material)}", f"\\begin{{tabular}}{{l{'r' * len(columns)}}}"]
+        lines += ["\\toprule", f"{head} \\\\", "\\midrule"]
+        for row in here:
+            cells_ = [_printed(here, row, column) for column in columns]
+            lines.append(" & ".join([_escaped(row["label"]), *cells_]) + " \\\\")
+        parts.append("\n".join([*lines, "\\bottomrule", "\\end{tabular}"]))
+    return "\n\n".join(parts) + "\n"
+
+
+def _printed(rows: Sequence[Row], row: Row, column: tuple[str, str, str, float]) -> str:
+    title, key, form, times = column
+    text = _in(form, row.get(key), times)
+    values = [float(each[key]) for each in rows if each.get(key) is not None]
+    if not text or title in ("CPU s", "kB"):
+        return text
+    best = min(values) if title == "FLIP" else max(values)
+    return f"\\textbf{{{text}}}" if float(row[key]) == best else text
+
+
+def _escaped(text: str) -> str:
+    """Text as LaTeX prints it."""
+    for sign in "&%$#_{}":
+        text = text.replace(sign, "\\" + sign)
+    return text
 
 
 def levels(rows: Sequence[Row], title: str, say: Any) -> str:

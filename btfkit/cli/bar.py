@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, final
 
@@ -23,8 +24,9 @@ class Bar:
     """
 
     def __init__(self, name: str, *, quiet: bool) -> None:
-        self._name = name
+        self._name, self._phase = name, ""
         self._start = time.monotonic()
+        self._whole_s: float | None = None
         self._silent = quiet or not sys.stderr.isatty()
         self._drawn: Progress | None = None
 
@@ -41,15 +43,43 @@ class Bar:
             self._drawn.stop()
 
     def __call__(self, done: float, total: float) -> None:
-        """Show that `done` of `total` is reached."""
+        """Show that `done` of `total` of the present part is reached."""
+        if self._ready() and self._drawn:
+            self._drawn.update(self._drawn.task_ids[0], completed=done, total=total)
+
+    def phase(self, name: str, left_s: float | None = None) -> None:
+        """A named part begins; `left_s` are the seconds that this and all later ones may take."""
+        self._phase = name
+        if left_s is not None:
+            self._whole_s = time.monotonic() - self._start + left_s
+        if self._ready() and self._drawn:
+            self._drawn.reset(
+                self._drawn.task_ids[0], total=None, description=f"{self._name}: {name}"
+            )
+
+    def clock(self) -> str:
+        """Time since the start and, where it is known, of the whole: `0:12 of 0:30`."""
+        passed = _minutes(time.monotonic() - self._start)
+        return passed if self._whole_s is None else f"{passed} of {_minutes(self._whole_s)}"
+
+    def _ready(self) -> bool:
+        """Whether the bar is drawn, now or already."""
         if self._silent or time.monotonic() - self._start < _PATIENCE_S:
-            return
+            return False
         if self._drawn is None:
-            self._drawn = _drawn(self._name)
-        self._drawn.update(self._drawn.task_ids[0], completed=done, total=total)
+            said = f"{self._name}: {self._phase}" if self._phase else self._name
+            self._drawn = _drawn(said, self.clock)
+        return True
 
 
-def _drawn(name: str) -> Progress:
+def _minutes(seconds: float) -> str:
+    whole = round(seconds)
+    if whole < 3600:
+        return f"{whole // 60}:{whole % 60:02}"
+    return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"
+
+
+def _drawn(name: str, clock: Callable[[], str]) -> Progress:
     """A started bar with one task."""
     from rich.console import Console
     from rich.progress import (
@@ -60,7 +90,6 @@ def _drawn(name: str) -> Progress:
         SpinnerColumn,
         Task,
         TextColumn,
-        TimeElapsedColumn,
         TimeRemainingColumn,
     )
     from rich.text import Text
@@ -71,13 +100,19 @@ def _drawn(name: str) -> Progress:
         def render(self, task: Task) -> Text:
             return Text(f"{task.speed:.1f}/s" if task.speed else "")
 
+    class Clock(ProgressColumn):
+        """Time of the whole, whatever its parts."""
+
+        def render(self, task: Task) -> Text:
+            return Text(clock())
+
     drawn = Progress(
         SpinnerColumn(),
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         Rate(),
-        TimeElapsedColumn(),
+        Clock(),
         TimeRemainingColumn(),
         console=Console(stderr=True),
         transient=True,

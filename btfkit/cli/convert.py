@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,7 +46,9 @@ def convert_verb(
     import btfkit
 
     written(btfkit.open(source), out, kind, dict(settings), force=force, progress=bar)
-    return Outcome(f"{out}: {kind}", {"out": out, "format": kind})
+    return Outcome(
+        f"{out}: {kind}", {"out": out, "format": kind}, then=f"btfkit info {shlex.quote(str(out))}"
+    )
 
 
 def written(

@@ -2,30 +2,81 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from btfkit.cli.bar import Bar
 from btfkit.cli.outcome import Outcome, verb
 
+if TYPE_CHECKING:
+    from btfkit.btf import BTF
+    from btfkit.materials.base import Material
+    from btfkit.queries import QuerySet
+
 
 @verb("eval", example="btfkit eval wool.neubtf.safetensors wool.btf.zarr --json")
 @click.argument("model", type=click.Path(path_type=Path))
 @click.argument("source", type=click.Path(path_type=Path))
-def eval_verb(bar: Bar, *, model: Path, source: Path) -> Outcome:
-    """Errors of MODEL on SOURCE, a BTF or a query file with answers."""
+@click.option("--all", "everything", is_flag=True, help="All pairs, those trained on as well.")
+def eval_verb(bar: Bar, *, model: Path, source: Path, everything: bool) -> Outcome:
+    """Errors of MODEL on SOURCE, a BTF or a query file with answers.
+
+    On the data that MODEL was fitted to, only what the fit held out is compared, unless --all
+    asks for everything; on other data everything is.
+    """
     from btfkit import sources
+    from btfkit.errors import BtfkitError
+    from btfkit.heldout import held_out
+    from btfkit.relief.relief import Relief
+
+    bar.phase("reading")
+    material, truth = sources.material(model), sources.measured(source)
+    if isinstance(truth, Relief):
+        raise BtfkitError(
+            f"{source} is a relief, and has no answers to compare with",
+            remedy="trace it first: btfkit synth --as zarr, or fit it: btfkit fit",
+        )
+    test = held_out(material.header.provenance, truth)
+    if test is not None and not len(test) and not everything:
+        raise BtfkitError(
+            f"{model} was fitted to all of {source} (holdout 0): there is no error but that of "
+            f"training",
+            remedy="--all gives it, or fit with --holdout 0.05",
+        )
+    rows = None if everything or test is None else test
+    bar.phase("evaluating")
+    errors = _errors(material, truth, rows, bar)
+    which = _which(material, truth, rows, test)
+    line = "  ".join(f"{k} {v:.6g}" for k, v in errors.items() if isinstance(v, (int, float)))
+    data: dict[str, Any] = {"model": model, "source": source, "which": which, **errors}
+    if test is not None:
+        data["held_out"] = test
+    then = f"btfkit render {shlex.quote(str(model))} --shape sphere"
+    return Outcome(f"{which}\n{line}", data, then=then)
+
+
+def _errors(material: Material, truth: BTF | QuerySet, rows: Any, bar: Bar) -> dict[str, Any]:
     from btfkit.btf import BTF
     from btfkit.materials import evaluation
-    from btfkit.queries import QuerySet
 
-    material, truth = sources.material(model), sources.measured(source)
     if isinstance(truth, BTF):
-        errors = evaluation.errors_on_btf(material, truth, progress=bar)
-    elif isinstance(truth, QuerySet):
-        errors = evaluation.errors_on_queries(material, truth)
-    else:
-        raise ValueError(f"{source} is a relief; trace it first: btfkit synth or ingest")
-    line = "  ".join(f"{k} {v:.6g}" for k, v in errors.items() if isinstance(v, (int, float)))
-    return Outcome(line, {"model": model, "source": source, **errors})
+        return evaluation.errors_on_btf(material, truth, pairs=rows, progress=bar)
+    return evaluation.errors_on_queries(material, truth if rows is None else truth.subset(rows))
+
+
+def _which(material: Material, truth: BTF | QuerySet, rows: Any, test: Any) -> str:
+    """What was compared, in words."""
+    count, known = len(truth), material.header.provenance
+    if test is None:
+        if "fingerprint" not in known:
+            return f"all {count}: the model does not say what it was fitted to"
+        origin = known.get("data", {}).get("hash")
+        if origin and origin == truth.provenance.get("hash"):
+            return f"all {count}: another part of the source of the fit, perhaps trained on"
+        return f"all {count}: not the data of the fit"
+    if rows is None:
+        return f"all {count}, {count - len(test)} of them trained on"
+    return f"held out: {len(rows)} of {count}"

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
+import textwrap
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -16,10 +19,24 @@ from btfkit.cli.options import (
     stem,
     the_only,
 )
-from btfkit.cli.outcome import Outcome, verb
+from btfkit.cli.outcome import INTERRUPTED, Outcome, command_line, verb
+
+if TYPE_CHECKING:
+    from btfkit.fitting.report import FitReport
 
 
-@verb("fit", example="btfkit fit wool.btf.zarr --model neubtf --budget 10m")
+def _models() -> str:
+    """Every model with its settings and their defaults, for `--help`."""
+    from btfkit.fitting import MODELS, settings_of
+
+    lines = ["Models and their settings (--set key=value), with defaults:", "", "\b"]
+    for model in MODELS:
+        given = " ".join(f"{name}={value}" for name, value in settings_of(model).items())
+        lines += textwrap.wrap(f"{model}: {given or 'none'}", 76, subsequent_indent="    ")
+    return "\n".join(lines)
+
+
+@verb("fit", example="btfkit fit wool.btf.zarr --model neubtf --budget 10m", more=_models)
 @click.argument("source", required=False, type=click.Path(path_type=Path))
 @click.option("--model", default="auto", show_default=True, help="Name of a model, or auto.")
 @out_option("The model file; by default SOURCE.MODEL.safetensors here")
@@ -28,7 +45,7 @@ from btfkit.cli.outcome import Outcome, verb
     type=DurationType(),
     default="5m",
     show_default=True,
-    help="Wall time of the training alone.",
+    help="Wall time from the end of reading to the end, evaluation included.",
 )
 @click.option("--steps", type=click.IntRange(min=0), help="Train this many steps instead.")
 @click.option(
@@ -43,6 +60,9 @@ from btfkit.cli.outcome import Outcome, verb
 )
 @click.option("--resume", is_flag=True, help="Go on with an interrupted fit of the same output.")
 @click.option("--set", "settings", type=SettingType(), multiple=True, help="A model's setting.")
+@click.option(
+    "--full-report", is_flag=True, help="Evaluate every held-out pair, beyond the budget."
+)
 @seed_option
 @force_option
 def fit_verb(
@@ -57,6 +77,7 @@ def fit_verb(
     device: str,
     resume: bool,
     settings: tuple[tuple[str, str], ...],
+    full_report: bool,
     seed: int,
     force: bool,
 ) -> Outcome:
@@ -65,14 +86,19 @@ def fit_verb(
     SOURCE: a native store, anything `btfkit ingest` reads, a relief file or a query file.
     Writes the model and OUT.report.json beside it. Ctrl-C keeps the best state so far.
     """
+    from btfkit.errors import unknown
     from btfkit.fitting import MODELS
     from btfkit.fitting.fit import fit
     from btfkit.sources import measured
 
     if model != "auto" and model not in MODELS:
-        raise ValueError(f"no model {model!r}; there are auto, {', '.join(MODELS)}")
+        raise ValueError(unknown("model", model, ["auto", *MODELS]))
+    bar.phase("reading")
     path = source or the_only(
-        Path().glob("*.btf.zarr"), what="stores", remedy="name one: btfkit fit STORE"
+        Path().glob("*.btf.zarr"),
+        what="stores",
+        remedy="name one: btfkit fit STORE",
+        first="btfkit ingest FOLDER, or name a SOURCE",
     )
     report = fit(
         measured(path),
@@ -85,7 +111,28 @@ def fit_verb(
         out=out or Path(f"{stem(path)}.{model}.safetensors"),
         resume=resume,
         settings=dict(settings),
+        full_report=full_report,
         progress=bar,
+        phase=bar.phase,
         force=force,
     )
-    return Outcome(report.line(), report.as_dict())
+    if report.interrupted:
+        return _to_go_on(report)
+    return Outcome(report.line(), report.as_dict(), then=_next(report))
+
+
+def _to_go_on(report: FitReport) -> Outcome:
+    """An interrupted fit: where its state lies, and the command that goes on with it."""
+    again = command_line(drop=("--force",), add=("--resume",))
+    state = f"{report.out}.state"
+    line = f"{report.line()}\n  state: {state}\n  go on: {again}"
+    data = {**report.as_dict(), "state": state, "go_on": again}
+    return Outcome(line, data, code=INTERRUPTED)
+
+
+def _next(report: FitReport) -> str:
+    """What one does with a fitted model."""
+    out = shlex.quote(report.out or "")
+    if report.material.model == "neubtf" and not report.untrained:
+        return f"btfkit propagate guidance.png --model {out}"
+    return f"btfkit render {out} --shape sphere"

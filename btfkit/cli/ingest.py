@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -67,11 +68,12 @@ def ingest_verb(
         jobs=jobs,
         force=force,
         progress=bar,
+        phase=bar.phase,
     )
     btf = btfkit.open(path)
     n, h, w, c = btf.shape
     return Outcome(
-        f"{path}: {n} textures of {h} x {w} x {c}",
+        f"{path}: {n} textures of {w} x {h}, {c} channels",
         {
             "out": path,
             "shape": btf.shape,
@@ -79,4 +81,5 @@ def ingest_verb(
             "format": btf.provenance["format"],
             "assumed": btf.provenance.get("assumed", {}),
         },
+        then=f"btfkit fit {shlex.quote(str(path))}",
     )

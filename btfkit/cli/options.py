@@ -79,19 +79,23 @@ class NumbersType(click.ParamType[tuple[Any, ...]]):
 
 @final
 class DurationType(click.ParamType[float]):
-    """`60s`, `5m`, `1.5h` or plain seconds, as seconds."""
+    """`60s`, `5m`, `1m30s`, `1.5h` or plain seconds, as seconds."""
 
-    name = "60s|5m"
+    name = "60s|5m|1m30s"
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
         if isinstance(value, float):
             return value
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|h|)", str(value))
-        seconds = float(match[1]) * {"s": 1, "": 1, "m": 60, "h": 3600}[match[2]] if match else 0
+        number = r"(\d+(?:\.\d+)?)"
+        match = re.fullmatch(
+            rf"(?:{number}\s*h\s*)?(?:{number}\s*m\s*)?(?:{number}\s*s?)?", str(value)
+        )
+        parts = [float(part or 0) for part in match.groups()] if match else [0.0]
+        seconds = sum(part * unit for part, unit in zip(parts, (3600, 60, 1), strict=False))
         if seconds <= 0:
-            self.fail(f"{value!r} is no time; expected like 60s or 5m", param, ctx)
+            self.fail(f"{value!r} is no time; expected like 60s, 5m or 1m30s", param, ctx)
         return seconds
 
 
@@ -121,8 +125,12 @@ force_option = click.option("--force", is_flag=True, help="Replace an existing o
 seed_option = click.option("--seed", type=int, default=0, show_default=True, help="Repeat a run.")
 
 
-def the_only(found: Iterable[Path], *, what: str, remedy: str) -> Path:
+def the_only(found: Iterable[Path], *, what: str, remedy: str, first: str | None = None) -> Path:
     """The one path of `found`; with none or several, an error that lists them.
+
+    Args:
+        found: what lies there. what: its name, in the plural.
+        remedy: how one of several is named. first: what makes one where there is none.
 
     Raises:
         BtfkitError: not exactly one.
@@ -130,6 +138,8 @@ def the_only(found: Iterable[Path], *, what: str, remedy: str) -> Path:
     paths = sorted(found)
     if len(paths) == 1:
         return paths[0]
+    if not paths and first:
+        remedy = f"first: {first}"
     listing = ", ".join(path.name for path in paths) or "none"
     raise BtfkitError(f"{what} in this folder: {listing}; expected exactly one", remedy=remedy)
 

@@ -6,6 +6,7 @@ import functools
 import inspect
 import json
 import os
+import shlex
 import sys
 import traceback
 import warnings
@@ -30,10 +31,14 @@ class Outcome:
     Attributes:
         line: for people; may span lines.
         data: for scripts: results, figures, output paths.
+        then: the command line that one would type next; shown to people alone.
+        code: exit code.
     """
 
     line: str
     data: Mapping[str, Any] = field(default_factory=dict)
+    then: str | None = None
+    code: int = DONE
 
 
 @final
@@ -44,17 +49,34 @@ class _Manners:
     as_json: bool = False
     quiet: bool = False
     debug: bool = False
+    typed: tuple[str, ...] = ()
+    code: int = DONE
 
 
 _manners = _Manners()
 
 
-def verb(name: str, *, example: str) -> Callable[[Callable[..., Outcome]], click.Command]:
+@final
+class _Command(click.Command):
+    """A command whose help may end in what takes a moment to find out."""
+
+    more: Callable[[], str] | None = None
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        if self.more is not None:
+            self.epilog = self.more()
+        super().format_epilog(ctx, formatter)
+
+
+def verb(
+    name: str, *, example: str, more: Callable[[], str] | None = None
+) -> Callable[[Callable[..., Outcome]], click.Command]:
     """Make a verb of a function that takes a `Bar` and its options, and returns an `Outcome`.
 
     Args:
         name: the verb.
         example: command lines that `--help` shows.
+        more: what stands at its end, asked for when it is shown.
     """
 
     def decorate(function: Callable[..., Outcome]) -> click.Command:
@@ -73,7 +95,9 @@ def verb(name: str, *, example: str) -> Callable[[Callable[..., Outcome]], click
         ):
             call = option(call)
         help_text = inspect.cleandoc(function.__doc__ or "") + "\n\nExample:\n\n\b\n" + example
-        return click.command(name, help=help_text)(call)
+        command = click.command(name, cls=_Command, help=help_text)(call)
+        command.more = more
+        return command
 
     return decorate
 
@@ -82,6 +106,7 @@ def run(group: click.Group, arguments: Sequence[str]) -> int:
     """Run the command line; returns the exit code."""
     _manners.as_json = "--json" in arguments
     _manners.debug = "--debug" in arguments
+    _manners.typed, _manners.code = tuple(arguments), DONE
     try:
         group.main(list(arguments), prog_name="btfkit", standalone_mode=False)
         sys.stdout.flush()
@@ -102,7 +127,13 @@ def run(group: click.Group, arguments: Sequence[str]) -> int:
         if _was_interrupted(error):
             return _failed("Interrupted", "interrupted; what was finished is kept", INTERRUPTED)
         return _failed(type(error).__name__, _message(error), FAILED)
-    return DONE
+    return _manners.code
+
+
+def command_line(*, drop: Sequence[str] = (), add: Sequence[str] = ()) -> str:
+    """The command line of this run, without some of its flags and with others."""
+    kept = [each for each in _manners.typed if each not in (*drop, *add)]
+    return shlex.join(["btfkit", *kept, *add])
 
 
 def _was_interrupted(error: BaseException) -> bool:
@@ -150,6 +181,9 @@ def _say(outcome: Outcome, warned: list[str]) -> None:
         _print_json({**outcome.data, **({"warnings": warned} if warned else {})})
     else:
         click.echo(outcome.line)
+        if outcome.then and not _manners.quiet:
+            click.echo(f"next: {outcome.then}", err=True)
+    _manners.code = outcome.code
 
 
 def _print_json(data: Mapping[str, Any]) -> None:

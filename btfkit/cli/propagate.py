@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -39,16 +40,18 @@ def propagate_verb(
     source = model or the_only(
         (path for path in Path().glob("*.safetensors") if has_encoder(path)),
         what="NeuBTF models with an encoder",
-        remedy="name one with --model, or fit one: btfkit fit --model neubtf",
+        remedy="name one with --model",
+        first="btfkit fit --model neubtf, or name one with --model",
     )
     final = out or Path(f"{stem(guidance)}.neubtf.safetensors")
     material = propagate(
         guidance, source, scale=scale, tileable=tileable, out=final, force=force, progress=bar
     )
     h, w = material.header.grid
-    line = f"{final}: {source.name} on {guidance.name}, {h} x {w} texels"
+    line = f"{final}: {source.name} on {guidance.name}, {w} x {h} texels"
     found = {"out": final, "model": source, "grid": (h, w), **material.header.provenance}
     if scale < 1:
         found["consistency_db"] = alike = consistency(guidance, source, scale=scale)
         line += f"; {alike:.1f} dB from the material at full size, shrunk"
-    return Outcome(line, found)
+    then = f"btfkit render {shlex.quote(str(final))} --shape sphere"
+    return Outcome(line, found, then=then)

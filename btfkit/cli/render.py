@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 _ANGLES = NumbersType("THETA,PHI", float)
 _LIGHT = (40.0, 45.0)
 _MOST_SIDE = 16384
+_SIDE = 512
 # Bytes of a BTF that is read as a whole.
 _IN_MEMORY = 1 << 30
 
@@ -31,7 +32,7 @@ _IN_MEMORY = 1 << 30
 btfkit render wool.btf.zarr -o wool.exr --shape torus --env hall.hdr --repeat 3""",
 )
 @click.argument("source", metavar="MODEL_OR_BTF", type=click.Path(path_type=Path))
-@out_option("*.png (sRGB) or *.exr (linear); by default the source's name with .png, here")
+@out_option("*.png or *.jpg (sRGB), *.exr (linear); by default the source's name with .png, here")
 @click.option("--shape", default="plane", show_default=True,
               help="plane, sphere, cylinder, torus or FILE.obj.")  # fmt: skip
 @click.option("--light", "lights", type=_ANGLES, multiple=True,
@@ -41,7 +42,9 @@ btfkit render wool.btf.zarr -o wool.exr --shape torus --env hall.hdr --repeat 3"
 @click.option("--view", type=_ANGLES, default="0,0", show_default=True, help="To the eye, degrees.")
 @click.option("--repeat", type=click.IntRange(1, 1000), default=1, show_default=True,
               help="Tiles across the front of the shape.")  # fmt: skip
-@click.option("--size", type=NumbersType("WxH", int, "x"), default="512x512", show_default=True)
+@click.option(
+    "--size", type=NumbersType("WxH", int, "x"), help="Pixels; by default 512 on the longer side."
+)
 @click.option("--spp", type=click.IntRange(1, 65536), help="Rays a pixel; as needed by default.")
 @click.option("--exposure", type=float, default=0.0, show_default=True, help="Stops, PNG only.")
 @click.option("--background", type=NumbersType("R,G,B", float), default="0,0,0", show_default=True,
@@ -59,7 +62,7 @@ def render_verb(
     env_turn: float,
     view: tuple[float, float],
     repeat: int,
-    size: tuple[int, int],
+    size: tuple[int, int] | None,
     spp: int | None,
     exposure: float,
     background: tuple[float, float, float],
@@ -79,7 +82,8 @@ def render_verb(
     from btfkit.shapes.catalogue import shape_of
 
     start = time.perf_counter()
-    w, h = _checked_size(size)
+    if size is not None:
+        _check_size(size)
     if not all(math.isfinite(number) for number in (env_turn, exposure, *background)):
         raise click.UsageError("--env-turn, --exposure and --background take finite numbers")
     final = out or Path(stem(source) + ".png")
@@ -89,6 +93,8 @@ def render_verb(
     if env is not None or shape != "plane":
         # Such a picture needs most of the textures anyway.
         material = _at_hand(material)
+    # A plane fills the picture, which by default has the shape of the material.
+    w, h = size or _shaped(material.header.aspect if shape == "plane" else 1.0)
     channels = material.header.channels
     if not lights and env is None:
         lights = (_LIGHT,)
@@ -120,15 +126,21 @@ def render_verb(
         f"{final}: {w} x {h}, {samples} rays a pixel, {seen.asked} queries, {seconds:.1f} s",
         {"out": final, "size": (w, h), "queries": seen.asked, "seconds": seconds,
          "cover": float(seen.cover.mean()), **about},
+        then="open it; --env FILE.hdr lights it by surroundings, --repeat tiles it",
     )  # fmt: skip
 
 
-def _checked_size(size: tuple[int, int]) -> tuple[int, int]:
+def _shaped(aspect: float) -> tuple[int, int]:
+    """Width and height of a picture of that shape, at most `_SIDE` pixels a side."""
+    short = max(1, round(_SIDE * min(aspect, 1 / aspect)))
+    return (_SIDE, short) if aspect >= 1 else (short, _SIDE)
+
+
+def _check_size(size: tuple[int, int]) -> None:
     if not all(1 <= side <= _MOST_SIDE for side in size):
         raise click.BadParameter(
             f"{size[0]}x{size[1]}; expected sides of 1 to {_MOST_SIDE} pixels", param_hint="--size"
         )
-    return size
 
 
 def _directions(option: str, angles: tuple[tuple[float, float], ...]) -> Floats:
@@ -144,13 +156,16 @@ def _directions(option: str, angles: tuple[tuple[float, float], ...]) -> Floats:
 
 
 def _at_hand(material: Material) -> Material:
-    """The same material, in memory where it is a small BTF."""
+    """The same material, in memory where it is a small BTF that is read lazily."""
     import numpy as np
 
     from btfkit.materials.measured.interpolation import Interpolation
+    from btfkit.textures import Textures
 
     lazy: Any = material.weights.get("texture")
-    if not isinstance(material, Interpolation) or 4 * math.prod(lazy.shape) > _IN_MEMORY:
+    if not (isinstance(material, Interpolation) and isinstance(lazy, Textures)):
+        return material
+    if 4 * math.prod(lazy.shape) > _IN_MEMORY:
         return material
     texture = lazy.batch(np.arange(len(lazy)))
     return Interpolation(material.spec, {**material.weights, "texture": texture}, material.header)

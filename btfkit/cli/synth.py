@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any, final
 
@@ -38,8 +39,8 @@ class FloatsType(click.ParamType[tuple[float, ...]]):
 @click.option("--list", "listing", is_flag=True, help="List the materials.")
 @click.option("--as", "kind", type=click.Choice(KINDS), default="zarr", show_default=True)
 @click.option("--size", type=click.IntRange(8, 4096), default=128, show_default=True)
-@click.option("--views", default="bonn81", show_default=True, help="bonn81, bonn151 or a number.")
-@click.option("--lights", default="bonn81", show_default=True, help="bonn81, bonn151 or a number.")
+@click.option("--views", default="19", show_default=True, help="bonn81, bonn151 or a number.")
+@click.option("--lights", default="19", show_default=True, help="bonn81, bonn151 or a number.")
 @click.option("--relief", "relief_texels", type=float, help="Height of the structure, texels.")
 @click.option("--bounces", type=click.IntRange(0, 16), default=0, help="Interreflections.")
 @click.option(
@@ -98,9 +99,11 @@ def synth_verb(
         raise click.UsageError("Missing option '-o' / '--out'.")
     if kind != "queries" and curvature is not None:
         raise click.UsageError("--curvature is for --as queries")
+    bar.phase("making the relief")
     relief = procedural.make(
         name, size, relief_texels=relief_texels, seed=seed, wrap="clamp" if clamp else "wrap"
     )
+    bar.phase("tracing and writing")
     if kind == "relief":
         from btfkit.relief.file import write
 
@@ -128,4 +131,14 @@ def synth_verb(
             from btfkit.cli.convert import written
 
             written(btf, out, {"ubo2014": "btf"}.get(kind, kind), {}, force=force, progress=bar)
-    return Outcome(f"{out}: {name}, synthetic, as {kind}", {"out": out, "name": name, "as": kind})
+    line = f"{out}: {name}, synthetic, as {kind}"
+    data = {"out": out, "name": name, "as": kind}
+    return Outcome(line, data, then=_next(out, kind))
+
+
+def _next(out: Path, kind: str) -> str:
+    """What one does with a sample of its kind."""
+    path = shlex.quote(str(out))
+    if kind == "relief":
+        return f"btfkit render {path} --shape sphere"
+    return f"btfkit fit {path}" if kind in ("zarr", "queries") else f"btfkit ingest {path}"

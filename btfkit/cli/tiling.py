@@ -20,6 +20,7 @@ def tile_file(
     source: str | os.PathLike[str],
     out: str | os.PathLike[str] | None = None,
     *,
+    drift: bool = True,
     force: bool = False,
     progress: Progress | None = None,
 ) -> tuple[Tiling, Path]:
@@ -28,6 +29,7 @@ def tile_file(
     Args:
         source: an image, a native store or a NeuBTF model.
         out: to write; None takes the name of `source` with .tile before its suffix, here.
+        drift: whether what drifts across a picture or a store is taken away.
         force: whether an existing `out` is replaced.
         progress: called with (done, total).
 
@@ -47,11 +49,11 @@ def tile_file(
         kind = None
     final = refuse_existing(out if out is not None else tile_name(path), force=force)
     if kind == "btf" and reader.detect(path):
-        return _tile_store(path, final, force, progress), final
+        return _tile_store(path, final, drift, force, progress), final
     if kind == "model":
         return _tile_model(path, final, force), final
     if kind in ("picture", "relief"):
-        return _tile_picture(path, final, force), final
+        return _tile_picture(path, final, drift, force), final
     raise _declined(path, kind)
 
 
@@ -74,7 +76,7 @@ def _declined(path: Path, kind: sources.Kind | None) -> BtfkitError:
 
 
 def _tile_store(
-    path: Path, final: Path, force: bool, progress: Callable[[int, int], None] | None
+    path: Path, final: Path, drift: bool, force: bool, progress: Callable[[int, int], None] | None
 ) -> Tiling:
     from btfkit.io.store import writer
     from btfkit.synthesis import tile_btf
@@ -82,7 +84,7 @@ def _tile_store(
     btf = reader.read(path)
     textures = btf.textures
     dtype = str(textures.dtype) if isinstance(textures, reader.StoreTextures) else None
-    tile, tiling = tile_btf(btf)
+    tile, tiling = tile_btf(btf, drift=drift)
     try:
         writer.write(tile, final, dtype=dtype, force=force, progress=progress)
     except writer.HalfRangeError:
@@ -108,14 +110,16 @@ def _tile_model(path: Path, final: Path, force: bool) -> Tiling:
     return tiling
 
 
-def _tile_picture(path: Path, final: Path, force: bool) -> Tiling:
+def _tile_picture(path: Path, final: Path, drift: bool, force: bool) -> Tiling:
     from btfkit.cli.pictures import WRITTEN, read_picture
     from btfkit.synthesis import tile_image
 
     if final.suffix.lower() not in WRITTEN:
         raise ValueError(f"{final}: pictures are written as {', '.join(WRITTEN)}")
     picture = read_picture(path)
-    tile, tiling = tile_image(picture.linear)
+    # Codes end at white; floats do not.
+    peak = 1.0 if picture.depth.kind == "u" else None
+    tile, tiling = tile_image(picture.linear, peak=peak, drift=drift)
     if tiling.drift is None and final.suffix.lower() == path.suffix.lower():
         # It tiles as it is: so do the bytes.
         with whole(final, force=force) as partial:

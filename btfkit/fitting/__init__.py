@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
+from dataclasses import fields
+from typing import Any
+
 # Models that are trained by steps: classes that implement `loop.Trainable`.
 TRAINED: dict[str, str] = {
     "rainer19": "btfkit.fitting.rainer.trainable:Rainer19",
@@ -17,6 +21,23 @@ CLOSED_FORM: dict[str, str] = {
     "pca": "btfkit.fitting.pca:pca",
 }
 MODELS: dict[str, str] = {**CLOSED_FORM, **TRAINED}
+# What `--set` reaches of each; none of these modules needs torch.
+SETTINGS: dict[str, str] = {
+    "lambert": "btfkit.fitting.lambert:Settings",
+    "interpolation": "btfkit.fitting.interpolation:Settings",
+    "pca": "btfkit.fitting.pca:Settings",
+    "rainer19": "btfkit.fitting.rainer.settings:Settings",
+    "rainer20": "btfkit.fitting.rainer.settings:Settings",
+    "neumip": "btfkit.fitting.neumip.settings:Settings",
+    "neumip-paper": "btfkit.fitting.neumip.settings:Settings",
+    "neubtf": "btfkit.fitting.neubtf.settings:Settings",
+}
+
+
+def settings_of(model: str) -> dict[str, Any]:
+    """Settings of a model with their defaults."""
+    module, name = SETTINGS[model].split(":")
+    return {f.name: f.default for f in fields(getattr(importlib.import_module(module), name))}
 
 
 def cuda_device() -> str:

@@ -80,7 +80,7 @@ def _for_btf(btf: BTF) -> Choice:
     if n < _SPARSE:
         why = f"interpolation: {n} pairs are too few to learn from, and few enough to keep"
         return Choice("interpolation", (why,))
-    reasons = [f"neumip: {len(lights)} lights and {len(views)} views of {h} x {w} texels"]
+    reasons = [f"neumip: {len(lights)} lights and {len(views)} views of {w} x {h} texels"]
     settings = {"levels": "1"}
     reasons.append(f"one level of detail: a BTF has no footprints; {_LEVELS}; levels=N makes N")
     if len(views) == 1:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+import warnings
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -75,6 +76,10 @@ class Trainable(ABC):
         del progress
         return True
 
+    def untrained(self) -> tuple[str, ...]:
+        """Parts that answer as if never trained, or hardly, one sentence each; none by default."""
+        return ()
+
     def on_device(self, device: str) -> Trainable | None:
         """The same model trained on a torch device, or None where it knows the CPU alone."""
         del device
@@ -142,10 +147,11 @@ def train(
         while (share := run.progress()) < 1.0:
             start, cpu = time.perf_counter(), time.process_time()
             loss = trainable.step(share)
-            run.elapsed_s += time.perf_counter() - start
-            run.cpu_s += time.process_time() - cpu
             run.done += 1
             keeper.after_step(loss)
+            # Looks and states are a part of what one waits for.
+            run.elapsed_s += time.perf_counter() - start
+            run.cpu_s += time.process_time() - cpu
             if progress:
                 progress(int(1000 * run.progress()), 1000)
     except KeyboardInterrupt:
@@ -202,8 +208,15 @@ class _Keeper:
     def save(self) -> None:
         """Write the resumable state, if this run keeps one."""
         self._saved_at = time.monotonic()
-        if self._file:
+        if not self._file:
+            return
+        try:
             save_state(self._file, self._trainable, self._run, self._generators, self._best)
+        except (OSError, SafetensorError) as error:
+            # What has been trained must not be lost for want of a way to go on with it.
+            warnings.warn(
+                f"{self._file} cannot be written ({error}): no --resume from here", stacklevel=2
+            )
 
     def finish(self) -> None:
         """Leave the trainable in its best state."""

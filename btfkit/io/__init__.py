@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import Any
 
 from btfkit.btf import BTF
-from btfkit.errors import FormatError
+from btfkit.errors import FormatError, unknown
 
 # The order is the order of detection: the more specific first.
 FORMATS: dict[str, str] = {
@@ -36,7 +36,7 @@ FORMATS: dict[str, str] = {
 def format_module(name: str) -> ModuleType:
     """The reader module of a format name; ValueError lists the names there are."""
     if name not in FORMATS:
-        raise ValueError(f"no format {name!r}; there are {', '.join(FORMATS)}")
+        raise ValueError(unknown("format", name, FORMATS))
     return importlib.import_module(FORMATS[name])
 
 
@@ -56,11 +56,25 @@ def detect(path: str | os.PathLike[str]) -> str:
     for name in FORMATS:
         if format_module(name).detect(source):
             return name
-    raise FormatError(
-        source,
-        f"no reader knows this {'folder' if source.is_dir() else 'file'}",
-        remedy=f"formats are {', '.join(FORMATS)}; name one with --format",
-    )
+    what = f"no reader knows this {'folder' if source.is_dir() else 'file'}"
+    remedy = f"formats are {', '.join(FORMATS)}; name one with --format"
+    photographs = _photographs(source)
+    if photographs:
+        what += f" of {photographs} pictures: nothing says where light and view were"
+        remedy += (
+            "; write a manifest.csv (file, light and view angles: docs/formats.md, pose manifests) "
+            "or, of one view, an RTI .lp beside them"
+        )
+    raise FormatError(source, what, remedy=remedy)
+
+
+def _photographs(source: Path) -> int:
+    """How many pictures lie in a folder, and in no folder of it."""
+    from btfkit.io.images import is_image
+
+    if not source.is_dir():
+        return 0
+    return sum(is_image(path.name) and path.is_file() for path in source.iterdir())
 
 
 def options_of(name: str) -> tuple[str, ...]:

@@ -107,6 +107,14 @@ class Material(ABC):
         self.header = header
         self._warned: set[str] = set()
 
+    def __repr__(self) -> str:
+        """Short: the model, its grid and its size."""
+        h, w = self.header.grid
+        size = sum(array.nbytes for array in self.weights.values() if hasattr(array, "nbytes"))
+        return f"{type(self).__name__}({w} x {h} texels, {len(self.header.channels)} channels, " + (
+            f"{size / 1e6:.2f} MB)"
+        )
+
     @classmethod
     @abstractmethod
     def shapes(cls, spec: Any, header: Header) -> dict[str, tuple[int, ...]]:

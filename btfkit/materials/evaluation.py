@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+import time
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -35,6 +37,7 @@ def errors_on_btf(
     btf: BTF,
     *,
     pairs: ArrayLike | None = None,
+    within_s: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Errors over whole textures.
@@ -42,12 +45,15 @@ def errors_on_btf(
     Args:
         material: what answers.
         btf: what was measured.
-        pairs: indices of the pairs to compare; None takes all.
-        progress: called with (pairs done, pairs).
+        pairs: indices of the pairs to compare, in this order; None takes all.
+        within_s: seconds after which no further pair is taken; at least one is. None takes all.
+        progress: called with (per mille done, 1000).
 
     Returns:
         mse, psnr, mse_log1p, psnr_log1p, mae, psnr_srgb (pooled over all texels), ssim_srgb and
-        flip (means over pairs), mean_psnr (mean over pairs of each pair's own), pairs, masked.
+        flip (means over pairs), mean_psnr (mean over pairs of each pair's own, but of
+        `exact_pairs`, whose own is infinite; None where no other is left), pairs that were
+        compared, of_pairs, masked.
 
     Raises:
         ValueError: channels differ, or nothing is measured.
@@ -57,22 +63,47 @@ def errors_on_btf(
             f"the model answers channels {material.header.channels}; the BTF has {btf.channels}"
         )
     chosen = np.arange(len(btf)) if pairs is None else np.asarray(pairs, np.intp)
+    answers = (answer_pair(material, btf, int(pair)) for pair in chosen)
+    return errors_of_pictures(answers, btf, pairs=chosen, within_s=within_s, progress=progress)
+
+
+def errors_of_pictures(
+    answers: Iterable[NDArray[np.float32]],
+    btf: BTF,
+    *,
+    pairs: ArrayLike | None = None,
+    within_s: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """The same of answers (h, w, c) that are given, one a pair; options as in `errors_on_btf`."""
+    chosen = np.arange(len(btf)) if pairs is None else np.asarray(pairs, np.intp)
     pooled, pictured = metrics.Pooled(), metrics.Pictured()
     own: list[float] = []
-    for done, pair in enumerate(chosen):
-        truth, answer = btf.texture(int(pair)), answer_pair(material, btf, int(pair))
+    start, done = time.perf_counter(), 0
+    for pair, answer in zip(chosen, answers, strict=True):
+        truth = btf.texture(int(pair))
         pooled.add(answer, truth)
         pictured.add(answer, truth)
         measured = np.isfinite(truth)
         if measured.any():
             own.append(metrics.psnr(float(np.square(answer - truth)[measured].mean())))
+        done += 1
+        spent = time.perf_counter() - start
+        share = done / len(chosen) if within_s is None else max(
+            done / len(chosen), min(spent / within_s, 1.0))  # fmt: skip
         if progress:
-            progress(done + 1, len(chosen))
+            progress(int(1000 * share), 1000)
+        # Another pair takes about as long as those before.
+        if within_s is not None and pooled.values and spent * (done + 1) / done > within_s:
+            break
+    finite = [value for value in own if math.isfinite(value)]
     return {
         **pooled.errors(),
         **pictured.errors(),
-        "mean_psnr": float(np.mean(own)),
-        "pairs": len(chosen),
+        "mean_psnr": float(np.mean(finite)) if finite else None,
+        "exact_pairs": len(own) - len(finite),
+        "pairs": done,
+        "of_pairs": len(chosen),
         "masked": pooled.masked,
     }
 
@@ -95,12 +126,33 @@ def errors_on_queries(material: Material, queries: QuerySet) -> dict[str, Any]:
         raise ValueError(f"all {len(queries)} rows are masked (not finite, or seen from below)")
     footprint = 0.5 if rows.footprint is None else rows.footprint
     curvature = 0.0 if rows.curvature is None else rows.curvature
-    rgb, opacity = material.evaluate(rows.uv, rows.light, rows.view, footprint, curvature)
+    answer = material.evaluate(rows.uv, rows.light, rows.view, footprint, curvature)
+    return {**_errors_of_rows(*answer, rows), "masked": int((~valid).sum())}
+
+
+def errors_on_answers(
+    rgb: NDArray[np.float32], opacity: NDArray[np.float32] | None, queries: QuerySet
+) -> dict[str, Any]:
+    """The same of answers (b, c) and opacities (b,) that are given."""
+    if queries.rgb is None or queries.rgb.shape != rgb.shape:
+        expected = None if queries.rgb is None else queries.rgb.shape
+        raise ValueError(f"answers of shape {rgb.shape}; expected {expected}")
+    valid = queries.valid()
+    cover = np.ones(len(rgb), np.float32) if opacity is None else opacity
+    found = _errors_of_rows(rgb[valid], cover[valid], queries.subset(valid))
+    return {**found, "masked": int((~valid).sum())}
+
+
+def _errors_of_rows(
+    rgb: NDArray[np.float32], opacity: NDArray[np.float32], rows: QuerySet
+) -> dict[str, Any]:
+    """Errors of answers to valid rows."""
+    if rows.rgb is None:
+        raise ValueError("the query file has no answers (rgb) to compare with")
     truth = rows.rgb if rows.opacity is None else np.where(rows.opacity[:, None] > 0, rows.rgb, 0)
     found: dict[str, Any] = {
         **_pooled(rgb, truth),
         "rows": len(rows),
-        "masked": int((~valid).sum()),
     }
     if rows.footprint is not None and np.ptp(rows.footprint) > 0:
         level = level_of(rows.footprint)

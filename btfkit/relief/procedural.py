@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.btf import Wrap
+from btfkit.errors import unknown
 from btfkit.relief.relief import Relief
 
 Floats = NDArray[np.floating]
@@ -42,7 +43,7 @@ def make(
         ValueError: no such material, or a size without structure.
     """
     if name not in CATALOGUE:
-        raise ValueError(f"no material {name!r}; there are {', '.join(CATALOGUE)}")
+        raise ValueError(unknown("material", name, CATALOGUE))
     if size < 8:
         raise ValueError(f"size = {size}; expected at least 8 texels")
     function, default = CATALOGUE[name]

@@ -57,8 +57,8 @@ def read_surroundings(path: Path, *, channels: Sequence[str]) -> Array:
 
 def check_name(path: Path) -> None:
     """ValueError unless a picture can be written under that name."""
-    if path.suffix.lower() not in (".png", ".exr"):
-        raise ValueError(f"{path}: pictures are *.png (sRGB) or *.exr (linear)")
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg", ".exr"):
+        raise ValueError(f"{path}: pictures are *.png or *.jpg (sRGB), or *.exr (linear)")
 
 
 def write(
@@ -73,7 +73,7 @@ def write(
 ) -> None:
     """Write a picture.
 
-    PNG: exposed, over the background, clamped to 0..1, sRGB encoded. EXR: float32 as it is,
+    PNG, JPEG: exposed, over the background, clamped to 0..1, sRGB encoded. EXR: float32 as it is,
     premultiplied by its cover, which is A; what the picture shows stands in "btfkit:about".
 
     Args:
@@ -95,7 +95,8 @@ def write(
     shown = picture.radiance @ to_rgb(channels) * np.float32(2.0**exposure)
     behind = (1 - picture.cover[..., None]) * np.asarray(background, np.float32)
     with whole(path, force=force) as partial:
-        partial.write_bytes(images.encode_png(shown + behind))
+        encode = images.encode_png if path.suffix.lower() == ".png" else images.encode_jpeg
+        partial.write_bytes(encode(shown + behind))
 
 
 def to_rgb(channels: Sequence[str]) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from btfkit.errors import unknown
 from btfkit.shapes.closed import Cylinder, Plane, Shape, Sphere
 from btfkit.shapes.torus import Torus
 
@@ -36,5 +37,5 @@ def shape_of(name: str, *, repeat: int = 1, aspect: float = 1.0, picture: float 
         "torus": Torus,
     }
     if name not in round_shapes:
-        raise ValueError(f"no shape {name!r}; there are {', '.join(SHAPES)}")
+        raise ValueError(unknown("shape", name, SHAPES))
     return round_shapes[name](repeat=repeat, aspect=aspect)

@@ -19,7 +19,7 @@ from btfkit.synthesis.indexmap import IndexMap
 from btfkit.synthesis.join import joined
 from btfkit.synthesis.period import Side, side_of
 from btfkit.synthesis.summary import Summary, spread_out
-from btfkit.synthesis.textures import Strengths, TiledTextures, without_drift
+from btfkit.synthesis.textures import Strengths, TiledTextures, gain_of, within
 
 Array = NDArray[np.float32]
 # Slices that are looked at for the one map of all.
@@ -35,13 +35,16 @@ class Tiling:
         index: where each texel of the tile comes from.
         sides: what was found of the rows and of the columns.
         drift: the fields that can take drift away; None where the sample tiles as it is.
-        seam_ratio: mean |step| across the ends of the tile over that inside, near 1 where it tiles.
+        seam_ratio: mean |step| across the ends of the tile over that inside (of a sample that
+            tiles as it is and repeats, over that a number of periods away), near 1 where it tiles.
+        bent: the largest relative change that taking drift away makes; 0 where none was taken.
     """
 
     index: IndexMap
     sides: tuple[Side, Side]
     drift: Drift | None
     seam_ratio: float
+    bent: float = 0.0
 
     @staticmethod
     def unchanged(size: tuple[int, int], seam_ratio: float) -> Tiling:
@@ -65,6 +68,7 @@ class Tiling:
             "of": list(self.index.source),
             "overlap": [side.overlap for side in self.sides],
             "agreement": [round(side.agreement, 4) for side in self.sides],
+            "drift": round(self.bent, 4),
         }
 
     @property
@@ -79,15 +83,19 @@ class Tiling:
 
 
 def make_tileable(image: Array) -> Array:
-    """An image (h, w, c), linear, as a tile; the same values where it tiles already."""
-    return tile_image(image)[0]
+    """An image (h, w, c), linear, 0..1, as a tile; the same values where it tiles already."""
+    return tile_image(image, peak=1.0)[0]
 
 
-def tile_image(image: Array) -> tuple[Array, Tiling]:
+def tile_image(
+    image: Array, *, peak: float | None = None, drift: bool = True
+) -> tuple[Array, Tiling]:
     """An image as a tile, and how it was made.
 
     Args:
         image: (h, w, c) linear; NaN where not measured.
+        peak: where its range ends, None where it has no end; values at both ends stay there.
+        drift: whether drift is taken away.
 
     Returns:
         (p, q, c) float32 tile: texels of the image times the gain that takes its drift away.
@@ -99,13 +107,17 @@ def tile_image(image: Array) -> tuple[Array, Tiling]:
         raise ValueError(f"the image has shape {image.shape}; expected (h, w, c)")
     values = np.where(np.isfinite(image), image, np.nan).astype(np.float32, copy=False)
     tiling = _tiling(Summary.of([values]))
-    tile = values
-    if tiling.drift is not None:
-        tile = without_drift(values, tiling.index, tiling.drift, tiling.drift.strengths(values))
-    return tile, replace(tiling, seam_ratio=metrics.seam_ratio(tile))
+    tile, change = tiling.index.of(values), 0.0
+    if tiling.drift is None:
+        return values, replace(tiling, seam_ratio=_seam_ratio(values, tiling))
+    if drift:
+        gain = gain_of(tiling.index, tiling.drift, tiling.drift.strengths(values))
+        change = float(np.abs(gain - 1).max())
+        tile = tile * gain if peak is None else within(tile, gain, peak)
+    return tile, replace(tiling, seam_ratio=metrics.seam_ratio(tile), bent=change)
 
 
-def tile_btf(btf: BTF) -> tuple[BTF, Tiling]:
+def tile_btf(btf: BTF, *, drift: bool = True) -> tuple[BTF, Tiling]:
     """A BTF as a tile: one map for all slices, each slice without its own drift; lazy.
 
     A sample that wraps is taken at its word and left as it is. Positions of near lights and views
@@ -118,22 +130,24 @@ def tile_btf(btf: BTF) -> tuple[BTF, Tiling]:
     if btf.wrap == "wrap":
         return btf, Tiling.unchanged(btf.shape[1:3], _seam(btf, chosen))
     tiling = _tiling(Summary.of(btf.texture(i) for i in chosen))
-    index, drift = tiling.index, tiling.drift
+    index, fields = tiling.index, tiling.drift
     changes: dict[str, Any] = {
         "wrap": "wrap",
         "provenance": {**btf.provenance, "tiled": tiling.record() | {"looked_at": chosen}},
         "history": (*btf.history, tiling.line()),
         **_far(btf, index),
     }
-    if drift is not None:
-        strengths = Strengths(btf, drift)
-        changes["textures"] = TiledTextures(btf.textures, index, drift, strengths)
+    change = 0.0
+    if fields is not None:
+        strengths = Strengths(btf, fields, kept=not drift)
+        change = strengths.largest(index, chosen)
+        changes["textures"] = TiledTextures(btf.textures, index, fields, strengths)
         if btf.validity is not None:
             changes["validity"] = btf.validity[:, index.rows, index.cols]
         if btf.variance is not None:
-            changes["variance"] = TiledTextures(btf.variance, index, drift, strengths, power=2)
+            changes["variance"] = TiledTextures(btf.variance, index, fields, strengths, power=2)
     tile = replace(btf, **changes)
-    return tile, replace(tiling, seam_ratio=_seam(tile, chosen))
+    return tile, replace(tiling, seam_ratio=_seam(tile, chosen), bent=change)
 
 
 def tile_neubtf(material: NeuBTF) -> tuple[NeuBTF, Tiling]:
@@ -166,6 +180,12 @@ def _tiling(summary: Summary) -> Tiling:
         return Tiling(IndexMap.identity(rows.size, cols.size), (rows, cols), None, 1.0)
     drift = Drift.of((rows.start, cols.start), (rows.tile, cols.tile), (rows.overlap, cols.overlap))
     return Tiling(joined(summary, rows, cols), (rows, cols), drift, 1.0)
+
+
+def _seam_ratio(image: Array, tiling: Tiling) -> float:
+    """Of a picture that tiles as it is: an edge that repeats is no seam."""
+    period = tiling.sides[0].period, tiling.sides[1].period
+    return metrics.seam_ratio(image, period=period)
 
 
 def _far(btf: BTF, index: IndexMap) -> dict[str, Any]:

@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
+import csv
+import importlib.util
 import json
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from btfkit.bench import cases, cells, kernels, run, targets
+from btfkit.bench import cases, cells, kernels, run
 from btfkit.bench.cases import asked, procedural, rows_of, stored
 from btfkit.btf import BTF
 from btfkit.cli import btfkit
 from btfkit.cli.outcome import run as run_cli
 from btfkit.errors import BtfkitError
 from btfkit.fitting import MODELS
+from btfkit.fitting.fit import fit
+from btfkit.heldout import split
+from btfkit.io import open as open_btf
 from btfkit.io import queryfile
 from btfkit.io.store import writer
+from btfkit.materials import file
 from btfkit.native import neural as native
+
+_AT = Path(__file__).parents[2] / "benchmarks" / "targets.py"
+_SPEC = importlib.util.spec_from_file_location("targets", _AT)
+targets = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(targets)
 
 compiled = pytest.mark.skipif(not native.available(), reason="the kernel was not built")
 TINY = run.Profile(
@@ -72,7 +84,14 @@ def test_a_run_reports_the_contracts_errors_and_is_taken_up_again(tmp_path, monk
     assert ours["levels"][0]["flip"] == ours["flip"]
     assert ours["machine"] == {key: found["machine"][key] for key in ours["machine"]}
     assert ours["curve"][-1]["cpu_s"] == pytest.approx(ours["cpu_seconds"])
-    for name in ("bench.json", "bench.md", "rate-distortion.png", "time-to-error.png"):
+    for name in (
+        "bench.json",
+        "bench.md",
+        "bench.csv",
+        "bench.tex",
+        "rate-distortion.png",
+        "time-to-error.png",
+    ):
         assert (tmp_path / "out" / name).stat().st_size > 500
     assert json.loads((tmp_path / "out" / "bench.json").read_text())["cells"] == found["cells"]
 
@@ -96,7 +115,6 @@ def test_a_model_that_refuses_a_material_is_reported_not_raised(tmp_path, monkey
     found = run.run(replace(TINY, models=("lambert",)), tmp_path / "out")
     assert found["cells"][0]["failed"] == "lambert wants more than 9 pairs"
     assert "wants more than 9 pairs" in (tmp_path / "out" / "bench.md").read_text()
-    assert found["targets"] == []
 
 
 def test_unknown_names_are_refused_with_what_there_is(tmp_path):
@@ -118,7 +136,7 @@ def test_the_verb_prints_one_json_object(tmp_path, capsys):
     assert found["machine"]["threads"] >= 1
     assert found["skips"] == [{"skip": "none", "ns": 1.0}]
     assert "## What each skip saves" in (tmp_path / "b" / "bench.md").read_text()
-    assert len(found["files"]) == 4
+    assert len(found["files"]) == 6
     assert run_cli(btfkit, ["bench", "jelly", "-o", str(tmp_path / "c")]) == 1
     assert "neither a file nor a material" in capsys.readouterr().err
 
@@ -364,3 +382,58 @@ def test_smaller_textures_change_little():
     assert table[0]["bytes"] > table[1]["bytes"] > table[2]["bytes"]
     assert table[1]["mae"] < 1e-3
     assert table[2]["mae"] < 1e-2
+
+
+def test_answers_from_elsewhere_are_scored_as_a_models_own(tmp_path, capsys):
+    """What lambert answers to the questions gets the errors of lambert's own cell."""
+    store = tmp_path / "cloth.btf.zarr"
+    writer.write(procedural("print", size=16, directions=5, seed=0).train, store)
+    common = ["bench", str(store), "-o", str(tmp_path / "out"), "--json"]
+    assert run_cli(btfkit, [*common, "--questions"]) == 0
+    (questions,) = json.loads(capsys.readouterr().out.splitlines()[-1])["questions"]
+    assert queryfile.read(Path(questions)).rgb is None
+
+    train = training_part(store)
+    material = fit(train, model="lambert", holdout=0).material
+    model, answers = tmp_path / "l.safetensors", tmp_path / "answers.npz"
+    file.save(material, model)
+    assert run_cli(btfkit, ["query", str(model), questions, "-o", str(answers)]) == 0
+
+    (tmp_path / "out" / "kernels.json").write_text("{}")
+    assert run_cli(btfkit, [*common, "--model", "lambert"]) == 0
+    assert run_cli(btfkit, [*common, "--answers", f"some & ours={answers}"]) == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])["cells"]
+    own, elsewhere = sorted(found, key=lambda row: row["model"] != "lambert")
+    assert elsewhere["model"] == "some & ours"
+    for key in CONTRACT:
+        # The questions are float32, the cell's own texel centres float64.
+        assert elsewhere[key] == pytest.approx(own[key], rel=1e-4)
+    with (tmp_path / "out" / "bench.csv").open() as table:
+        lines = list(csv.DictReader(table))
+    assert [line["label"] for line in lines] == [row["label"] for row in found]
+    assert float(lines[0]["psnr"]) == found[0]["psnr"]
+    printed = (tmp_path / "out" / "bench.tex").read_text()
+    assert r"some \& ours & " in printed
+    assert printed.count(r"\begin{tabular}") == printed.count(r"\end{tabular}") == 1
+    assert "## Targets" not in (tmp_path / "out" / "bench.md").read_text()
+
+
+def test_answers_to_other_questions_are_refused(tmp_path, capsys):
+    store = tmp_path / "cloth.btf.zarr"
+    writer.write(procedural("print", size=16, directions=3, seed=0).train, store)
+    common = ["bench", str(store), "-o", str(tmp_path / "out")]
+    assert run_cli(btfkit, [*common, "--questions"]) == 0
+    asked = queryfile.read(Path(capsys.readouterr().out.strip()))
+    wrong = replace(asked, rgb=np.zeros((len(asked), 3)), uv=asked.uv[::-1])
+    queryfile.write(wrong, tmp_path / "a.npz")
+    assert run_cli(btfkit, [*common, "--answers", f"ours={tmp_path / 'a.npz'}"]) == 1
+    assert "not the questions of cloth, in their order" in capsys.readouterr().err
+    queryfile.write(asked, tmp_path / "b.npz")
+    assert run_cli(btfkit, [*common, "--answers", f"ours={tmp_path / 'b.npz'}"]) == 1
+    assert "has no answers (rgb)" in capsys.readouterr().err
+
+
+def training_part(store):
+    """The pairs of a store that its models are trained on."""
+    btf = open_btf(store)
+    return btf.subset(split(len(btf))[0])

@@ -143,7 +143,7 @@ def test_a_store_can_be_ingested_again_in_part(
         call("ingest", store, "-o", out, "--roi", "2:6,:4", "--lights", "0:6:2", "--texel-mm", 0.5)
         == 0
     )
-    assert "3 textures of 4 x 4 x 3" in capsys.readouterr().out
+    assert "3 textures of 4 x 4, 3 channels" in capsys.readouterr().out
     assert call("info", out, "--json") == 0
     data = json.loads(capsys.readouterr().out)
     assert data["provenance"]["options"] == {
@@ -179,8 +179,9 @@ def test_fit_without_a_source_lists_the_stores_and_how_to_name_one(
         (tmp_path / f"s{index}.btf.zarr").mkdir()
     assert call("fit", "--model", "lambert") == 1
     listing = "s0.btf.zarr, s1.btf.zarr" if stores else "none"
+    remedy = "name one" if stores else "first: btfkit ingest"
     assert (
-        f"stores in this folder: {listing}; expected exactly one; name one"
+        f"stores in this folder: {listing}; expected exactly one; {remedy}"
         in capsys.readouterr().err
     )
 

@@ -276,3 +276,59 @@ def test_ingesting_holds_no_more_than_a_shard_and_a_few_textures_a_worker(
     tracemalloc.stop()
     # Per worker: a shard of four half textures, its encoded copy, one float32 texture and masks.
     assert peak < 2 * 8 * texture
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32"])
+def test_chunks_read_straight_from_the_shards_are_those_that_zarr_reads(
+    dtype: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer, "_SHARD_BYTES", 2 * 6 * 7 * 3 * 4)  # two or four textures a shard
+    path = writer.write(small_btf(), tmp_path / "a.btf.zarr", dtype=dtype)
+    textures = btfkit.open(path).textures
+    assert isinstance(textures, reader.StoreTextures)
+    assert textures._chunks is not None
+    array = zarr.open_group(path, mode="r")["texture"]
+    for pair in range(5):
+        np.testing.assert_array_equal(textures[pair], np.asarray(array[pair], np.float32))
+
+
+def test_a_store_that_is_packed_otherwise_is_read_by_zarr(tmp_path: Path) -> None:
+    path = writer.write(small_btf(variance=None), tmp_path / "a.btf.zarr", dtype="float32")
+    group = zarr.open_group(path, mode="r+")
+    values, names = np.asarray(group["texture"][...]), ("pair", "row", "column", "channel")
+    group.create_array("texture", data=values, chunks=(1, 6, 7, 3), shards=(5, 6, 7, 3),
+                       compressors=[zarr.codecs.ZstdCodec()], dimension_names=names,
+                       overwrite=True)  # fmt: skip
+    textures = btfkit.open(path).textures
+    assert isinstance(textures, reader.StoreTextures)
+    assert textures._chunks is None
+    np.testing.assert_array_equal(textures[3], values[3])
+
+
+@pytest.mark.parametrize("bytes_", [64 << 20, 5 * 7 * 3 * 2 * 2, 1])
+def test_abrdfs_are_those_of_the_textures_whatever_band_is_kept(
+    bytes_: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader, "_BAND_BYTES", bytes_)
+    btf = btfkit.open(writer.write(small_btf(), tmp_path / "a.btf.zarr"))
+    images = btf.batch(range(5))
+    for row in (0, 1, 5, 2):
+        np.testing.assert_array_equal(btf.abrdf(row, 3), images[:, row, 3])
+    rows, cols = np.array([0, 5, 3, 1, 2]), np.array([6, 0, 1, 2, 3])
+    np.testing.assert_array_equal(
+        btf.texels(range(5), rows, cols), images[np.arange(5), rows, cols]
+    )
+
+
+def test_an_abrdf_reads_each_texture_once_and_its_neighbours_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    btf = btfkit.open(writer.write(small_btf(), tmp_path / "a.btf.zarr"))
+    read: list[int] = []
+    original = reader.StoreTextures._read
+    monkeypatch.setattr(
+        reader.StoreTextures, "_read", lambda self, i: read.append(i) or original(self, i)
+    )
+    for col in range(7):
+        btf.abrdf(2, col)
+    assert sorted(read) == [0, 1, 2, 3, 4]

@@ -885,7 +885,7 @@ def test_a_relief_is_drawn_by_the_tracer(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("options", "code", "message"), [
     (("--shape", "cube"), 1, "no shape 'cube'; there are plane, sphere, cylinder, torus, FILE.obj"),
     (("--shape", "none.obj"), 1, "none.obj: No such file"),
-    (("-o", "a.jpg"), 1, r"a.jpg: pictures are \*.png"),
+    (("-o", "a.gif"), 1, r"a.gif: pictures are \*.png"),
     (("--size", "0x5"), 2, "0x5; expected sides of 1 to 16384"),
     (("--light", "nan,0"), 2, "expected finite angles"),
     (("--view", "1"), 2, "expected THETA,PHI"),

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import pickle
 import resource
 import subprocess
@@ -28,7 +29,7 @@ from btfkit import directions, propagation
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.fitting import fit
-from btfkit.fitting.neubtf import augment
+from btfkit.fitting.neubtf import augment, trainable
 from btfkit.footprint import level_sizes
 from btfkit.io import anglenames, images, queryfile
 from btfkit.io.anglenames import Angles
@@ -250,7 +251,10 @@ def test_group_12_texels_beyond_32_bit_offsets_are_addressed(tmp_path: Path) -> 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "m.safetensors"
-    fit.fit(sources.small_btf(), model="neubtf", steps=2, holdout=0.0, out=path)
+    with pytest.MonkeyPatch.context() as patch:
+        # What two steps carry is of no account here.
+        patch.setattr(trainable, "_LEAST_TAUGHT", 1)
+        fit.fit(sources.small_btf(), model="neubtf", steps=2, holdout=0.0, out=path)
     return path
 
 
@@ -260,7 +264,7 @@ def test_group_22_one_picture_guides_alike_in_8_and_16_bit_with_alpha_and_as_val
     codes = np.random.default_rng(0).integers(0, 256, (16, 24, 3), np.uint8)
     cv2.imwrite(str(tmp_path / "8.png"), codes)
     cv2.imwrite(str(tmp_path / "16.png"), codes.astype(np.uint16) * 257)
-    cv2.imwrite(str(tmp_path / "a.png"), np.concatenate([codes, codes[..., :1]], axis=2))
+    cv2.imwrite(str(tmp_path / "a.png"), np.concatenate([codes, codes[..., :1] | 1], axis=2))
     linear = images.read("8.png", (tmp_path / "8.png").read_bytes(), transfer="srgb")
     np.testing.assert_allclose(
         # The encoder sees what the photograph held, whatever it was decoded to.
@@ -268,7 +272,9 @@ def test_group_22_one_picture_guides_alike_in_8_and_16_bit_with_alpha_and_as_val
     )  # fmt: skip
     expected = propagation.propagate(linear, fitted).weights["texture"].astype(np.float32)
     for name in ("8.png", "16.png", "a.png"):
-        texture = propagation.propagate(tmp_path / name, fitted).weights["texture"]
+        said = pytest.warns(UserWarning, match="no opacity: 0 texels")
+        with said if name == "a.png" else contextlib.nullcontext():
+            texture = propagation.propagate(tmp_path / name, fitted).weights["texture"]
         # float16 textures.
         np.testing.assert_allclose(texture.astype(np.float32), expected, atol=5e-3)
 

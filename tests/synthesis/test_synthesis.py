@@ -751,7 +751,7 @@ def test_a_model_becomes_a_model_without_its_encoder(
     file.save(neubtf(), "wool.neubtf.safetensors", training=training)
     assert has_encoder("wool.neubtf.safetensors")
     assert call("tile", "wool.neubtf.safetensors") == 0
-    assert "wool.tile.neubtf.safetensors: tile of 52 x 66" in capsys.readouterr().out
+    assert "wool.tile.neubtf.safetensors: tile of 66 x 52" in capsys.readouterr().out
     tile = btfkit.load("wool.tile.neubtf.safetensors")
     assert tile.header.wrap == "wrap"
     assert tile.header.grid == (52, 66)

@@ -37,6 +37,10 @@ from btfkit.materials.base import Header
 from btfkit.materials.neubtf import NeuBTFSpec
 from btfkit.settings import parsed
 
+# Steps before which an encoder carries little (64 x 64 wool onto itself: 17 dB after 100, 22 after
+# 250).
+_LEAST_TAUGHT = 200
+
 
 @final
 class NeuBTF(Trainable):
@@ -70,7 +74,7 @@ class NeuBTF(Trainable):
         self._guides = Guides(
             self._frontal, self._pool, wrap=self._wrap, settings=s, generator=generators.torch
         )
-        self._steps = 0
+        self._steps = self._taught = 0
         self._rate = 1.0
         self._has_encoder = s.encoder
         self._build()
@@ -113,10 +117,19 @@ class NeuBTF(Trainable):
             self._end_first_stage()
         if stage == 1:
             return self._step_latents(share)
+        self._taught += 1
         return self._step_teach(share) if stage == 2 else self._step_joint(share)
 
     def settled(self, progress: float) -> bool:
         return not self._has_encoder or progress > self.settings.first + self.settings.second
+
+    def untrained(self) -> tuple[str, ...]:
+        taught = self._taught
+        if not self._has_encoder or taught >= _LEAST_TAUGHT:
+            return ()
+        if not taught:
+            return ("the encoder: its stage had not begun, and nothing can be propagated",)
+        return (f"the encoder: {taught} steps of {_LEAST_TAUGHT} at least; it carries poorly",)
 
     def slow_down(self) -> None:
         self._rate *= 0.5
@@ -151,14 +164,14 @@ class NeuBTF(Trainable):
 
     def state(self) -> dict[str, Tensor]:
         found = tensors_of(self._modules(), self._optimisers)
-        numbers = [self._steps, self._rate, self._stage_done, self.queries]
+        numbers = [self._steps, self._rate, self._stage_done, self.queries, self._taught]
         found["numbers"] = torch.tensor(numbers, dtype=torch.float64)
         return found | {"mean": self._mean.clone(), "deviation": self._deviation.clone()}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         restore_tensors(state, self._modules(), self._optimisers)
-        steps, rate, stage, queries = state["numbers"].tolist()
-        self._steps, self._rate = int(steps), rate
+        steps, rate, stage, queries, taught = state["numbers"].tolist()
+        self._steps, self._rate, self._taught = int(steps), rate, int(taught)
         self._stage_done, self.queries = int(stage), int(queries)
         self._mean, self._deviation = state["mean"].clone(), state["deviation"].clone()
 

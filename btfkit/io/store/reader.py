@@ -10,6 +10,7 @@ Every chunk is compressed and carries a CRC32C, so a damaged one is told, never 
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, final
 
@@ -17,14 +18,18 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from btfkit import native
 from btfkit.btf import BTF, QUANTITY
 from btfkit.errors import FormatError
-from btfkit.textures import Array, Textures
+from btfkit.io.store.chunks import Chunks, are_ours
+from btfkit.textures import Array, Index, Textures
 
 VERSION = 1
 IMAGE_AXES = ("pair", "row", "column", "channel")
 # More values a texture, or more pairs, than this: a damaged header, not a sample.
 _MOST_VALUES, _MOST_PAIRS = 1 << 31, 1 << 24
+# Memory for rows of all textures, which ABRDFs are taken from.
+_BAND_BYTES = 64 << 20
 _AGAIN = "ingest the source again, or copy the store again"
 
 
@@ -108,18 +113,49 @@ class StoreTextures(Textures):
         self.dtype = array.dtype
         self._path, self._array = path, array
         self._run = (array.shards or array.chunks)[0]
+        self._chunks = Chunks(array, self._shard) if are_ours(array) else None
+        self._band: tuple[int, Array] | None = None
+
+    def _shard(self, shard: int) -> Path:
+        return shard_path(self._path / self._array.basename, shard)
 
     def _read(self, index: int) -> Array:
-        shard = shard_path(self._path / self._array.basename, index // self._run)
+        shard = self._shard(index // self._run)
         if not shard.is_file():
             # Zarr answers a missing shard with the fill value, silently.
             raise FormatError(shard, f"missing; it holds pair {index}", remedy=_AGAIN)
         try:
+            if self._chunks:
+                return self._chunks.read(index)
             return np.asarray(self._array[index], np.float32)
         except Exception as error:  # whatever the codecs raise on damaged bytes
             raise FormatError(
                 shard, f"the chunk of pair {index} is damaged ({error})", remedy=_AGAIN
             ) from error
+
+    def texels(self, pairs: Index, rows: Index, cols: Index) -> Array:
+        """(b, c) scattered values; asked for most pairs, a band of rows of all is kept at hand."""
+        n, h, w, c = self.shape
+        height = min(h, _BAND_BYTES // (n * w * c * self.dtype.itemsize))
+        first = int(rows.min(initial=h)) // max(height, 1) * height
+        few = 2 * len(np.unique(pairs)) < n
+        if few or height < 1 or int(rows.max(initial=0)) >= first + height:
+            return super().texels(pairs, rows, cols)
+        if self._band is None or self._band[0] != first:
+            self._band = first, self._rows(slice(first, min(first + height, h)))
+        return self._band[1][pairs, rows - first, cols].astype(np.float32)
+
+    def _rows(self, rows: slice) -> Array:
+        """(n, rows, w, c) some rows of every texture, read by all processors."""
+        band = np.empty((len(self), rows.stop - rows.start, *self.shape[2:]), self.dtype)
+
+        def read(pair: int) -> None:
+            band[pair] = self._read(pair)[rows]
+
+        with ThreadPoolExecutor(native.threads()) as workers:
+            for _ in workers.map(read, range(len(self))):
+                pass
+        return band
 
 
 def shard_path(array: Path, shard: int) -> Path:

@@ -24,7 +24,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from btfkit import native
 from btfkit.btf import BTF, QUANTITY
 from btfkit.errors import BtfkitError
-from btfkit.files import refuse_existing, replace_folder
+from btfkit.files import named, refuse_existing, replace_folder
 from btfkit.io.store.reader import IMAGE_AXES, VERSION, shard_path
 from btfkit.journal import Journal, alone, partial_folder, to_disk
 from btfkit.textures import HALF_RANGE, Textures, as_textures
@@ -172,8 +172,12 @@ class _Job:
                         remedy="write float32",
                     )
                 block[slot] = np.where(finite, image, np.nan)
-            array[run.start : run.stop] = block
-            to_disk(shard_path(self.folder / name, run.start // self.run))
+            shard = shard_path(self.folder / name, run.start // self.run)
+            try:
+                array[run.start : run.stop] = block
+            except OSError as error:
+                raise named(error, shard) from error
+            to_disk(shard)
         self.journal.note({"shard": run.start // self.run, "masked": masked})
         return len(run)
 

@@ -6,9 +6,14 @@ not a run of that budget.
 
 from __future__ import annotations
 
+import json
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
+
+from btfkit.bench.tables import generic
 
 Row = Mapping[str, Any]
 
@@ -110,3 +115,13 @@ def _budget(row: Row) -> str:
 
 def _decibel(row: Row) -> str:
     return f"{float(row['psnr_log1p']):.2f} dB"
+
+
+def main() -> None:
+    """A table of the targets from a bench.json: python benchmarks/targets.py bench/bench.json."""
+    rows = json.loads(Path(sys.argv[1]).read_text())["cells"]
+    print(generic(targets(rows)))
+
+
+if __name__ == "__main__":
+    main()

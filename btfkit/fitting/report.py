@@ -1,0 +1,98 @@
+"""What a fit gave: its material, its errors, and what it took."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, final
+
+from btfkit.files import whole
+from btfkit.jsonvalues import plain
+from btfkit.materials.base import Material
+
+
+@final
+@dataclass(frozen=True)
+class FitReport:
+    """What a fit gave.
+
+    Attributes:
+        material: the fitted model.
+        errors: held-out errors by the keys of docs/metrics.md; empty without held-out data. Of a
+            budget's run they are of as many held-out pairs as it left time for: `pairs` of
+            `of_pairs`.
+        seconds, cpu_seconds: of the training alone.
+        steps, queries: taken and seen.
+        parameters: weights but textures. bytes: of all arrays that answering needs.
+        curve: (seconds, step, score) at every look at the held-out data.
+        choice: why `auto` took this model and these parts, and why a GPU is not used.
+        masked_texels: texels (or rows) that are not measured and were left out.
+        device: what it was trained on.
+        interrupted: whether the user ended it early.
+        held_out: indices of the pairs (or rows) that were not trained on: those of
+            `btfkit.split(count, holdout, seed)`.
+        untrained: parts of the model that answer as if they had never been trained, or hardly.
+        phases: wall seconds of reading, starting, training, writing and evaluating.
+    """
+
+    material: Material
+    errors: Mapping[str, Any]
+    seconds: float
+    cpu_seconds: float
+    steps: int
+    queries: int
+    parameters: int
+    bytes: int
+    curve: tuple[tuple[float, int, float], ...] = ()
+    choice: tuple[str, ...] = ()
+    masked_texels: int = 0
+    interrupted: bool = False
+    out: str | None = None
+    settings: Mapping[str, str] = field(default_factory=dict)
+    device: str = "cpu"
+    held_out: tuple[int, ...] = ()
+    untrained: tuple[str, ...] = ()
+    phases: Mapping[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Short: errors and histories are for who asks for them."""
+        return f"FitReport({self.line().splitlines()[0]})"
+
+    def as_dict(self) -> dict[str, Any]:
+        """The report as JSON types; errors stand at the top level under their own keys."""
+        rest = {k: v for k, v in self.__dict__.items() if k not in ("material", "errors")}
+        return {"model": self.material.model, **self.errors, **rest}
+
+    def line(self) -> str:
+        """For people: one line, and one for each part that is not trained or reason of `auto`."""
+        line = (
+            f"{self.out or self.material.model}: {self.material.model}, {self._error()}, "
+            f"{self.steps} steps in {self.seconds:.1f} s of {sum(self.phases.values()):.1f} s, "
+            f"{self.parameters} weights, {self.bytes / 1e6:.2f} MB"
+        )
+        if self.interrupted:
+            line += "; interrupted"
+        return "\n  ".join([line, *(f"not trained: {part}" for part in self.untrained),
+                            *self.choice])  # fmt: skip
+
+    def write(self, path: Path) -> None:
+        """Write it as JSON, with the material's header."""
+        header = asdict(self.material.header)
+        text = json.dumps(plain({**self.as_dict(), "header": header}), indent=1)
+        with whole(path, force=True) as partial:
+            partial.write_text(text)
+
+    def _error(self) -> str:
+        psnr = self.errors.get("psnr")
+        if psnr is None:
+            return "no held-out data"
+        pairs, of = self.errors.get("pairs"), self.errors.get("of_pairs")
+        some = f" ({pairs} of {of} pairs)" if pairs != of else ""
+        return f"held-out PSNR {psnr:.2f} dB{some}"
+
+
+def report_file(out: Path) -> Path:
+    """Where the report of a model file lies."""
+    return out.with_name(out.name.removesuffix(".safetensors") + ".report.json")
