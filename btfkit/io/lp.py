@@ -19,9 +19,8 @@ import numpy as np
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.io import archive as archives
-from btfkit.io import images, named
+from btfkit.io import named
 from btfkit.io.archive import Archive
-from btfkit.textures import Array
 
 _BETWEEN = " \t,;"
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -79,10 +78,7 @@ def read(
     light = np.array([light for _, light in present])
     light[:, 1] *= y_sign(values["orientation"])
     view = np.broadcast_to([0.0, 0.0, 1.0], light.shape)
-
-    def decode(name: str, data: bytes) -> Array:
-        return images.read(name, data, transfer=values["transfer"])
-
+    decode = named.Decoder.of(values, record)
     return named.assembled(
         path,
         named.ImageTextures(

@@ -11,11 +11,12 @@ from typing import Any, final
 import numpy as np
 
 from btfkit import colour
-from btfkit.btf import BTF, COLOUR
+from btfkit.btf import BTF, COLOUR, RGB
 from btfkit.errors import FormatError
 from btfkit.io import archive as archives
-from btfkit.io import images, named
+from btfkit.io import images, named, spectral
 from btfkit.io.archive import Archive
+from btfkit.io.images import Image, exr
 from btfkit.io.manifest.poses import MM, End, Pose
 from btfkit.nearfield import PointLight
 from btfkit.textures import Array
@@ -120,32 +121,29 @@ def assemble(path: Path, holder: Archive, base: str, head: Head, entries: Sequen
     if all(pose.view is None for pose in present):
         record["assumed"] = {**record["assumed"], "view": "from above"}
     files = [archives.inside(pose.file, base) or "" for pose in present]
-    decode = _Decode(head.transfer, head.channels)
+    codes = named.Decoder(head.transfer, assumed="transfer" in head.record["assumed"])
+    decode = _Decode(codes, head.channels)
     plain = named.ImageTextures(holder, files, decode)
     exposure = _exposures(path, present)
     near = _near_light(path, head, light_mm, plain.shape[3])
     far = named.cosine_factor(head.cosine, light) if light_mm is None else None
 
-    def scale(index: int, h: int, w: int) -> Array:
-        factor = np.full((1, 1, 1), exposure[index], np.float32)
-        for other in (near, far):
-            factor = factor if other is None else factor * other(index, h, w)
-        return factor
-
-    def squared(index: int, h: int, w: int) -> Array:
-        return scale(index, h, w) ** 2
-
+    gains = named.Gains(exposure[:, None])
     variance = _variance(path, holder, base, present, head)
     unscaled = near is None and far is None and (exposure == 1).all()
     footprint = _numbers(path, present, "footprint")
     return named.assembled(
         path,
-        plain if unscaled else plain.scaled(scale),
+        plain if unscaled else plain.scaled(named.Product(gains, near, far)),
         light=light,
         view=view,
         light_position=light_mm,
         view_position=view_mm,
-        variance=variance if unscaled or variance is None else variance.scaled(squared),
+        variance=(
+            variance
+            if unscaled or variance is None
+            else variance.scaled(named.Product(gains, near, far, power=2))
+        ),
         footprint=None if footprint is None else footprint.astype(np.float32),
         channels=decode.channels,
         colour=head.colour,
@@ -165,23 +163,42 @@ def assemble(path: Path, holder: Archive, base: str, head: Head, entries: Sequen
 
 @final
 class _Decode:
-    """Images with the channels that the manifest or the first image names, in that order."""
+    """Images with the channels that the manifest names, or else by what the first one holds.
 
-    def __init__(self, transfer: str, channels: tuple[str, ...] | None) -> None:
-        self._transfer, self.channels = transfer, channels
+    Without names an EXR is its colour, or its wavelengths where it has such.
 
-    def __call__(self, name: str, data: bytes) -> Array:
+    Args:
+        codes: of everything but EXRs.
+        channels: to pick by name; None takes what the first image has.
+        variance: whether values are variances: of a mixture its squared weights count.
+
+    Attributes:
+        channels: those that were taken, once an image is decoded; layers' prefixes fall off.
+    """
+
+    def __init__(
+        self, codes: named.Decoder, channels: tuple[str, ...] | None, *, variance: bool = False
+    ) -> None:
+        self._codes, self._asked, self._variance = codes, channels, variance
+        self.channels: tuple[str, ...] | None = None
+
+    def __call__(self, name: str, data: bytes) -> Image:
         if not name.lower().endswith(".exr"):
-            return images.read(name, data, transfer=self._transfer)
-        pixels, names, _ = images.read_exr(name, data)
-        if self.channels is None:
-            self.channels = tuple(n for n in names if n != "A") or names
-        lacking = [n for n in self.channels if n not in names]
+            return self._codes(name, data)
+        file = images.read_exr(name, data)
+        names = file[1]
+        waves = {} if self._asked else spectral.wavelengths(name, names)
+        taken = self._asked or tuple(waves[nm] for nm in sorted(waves)) or exr.colours(name, names)
+        lacking = [n for n in taken if n not in names]
         if lacking:
             raise FormatError(
                 name, f"has channels {', '.join(names[:8])}; expected {', '.join(lacking[:8])}"
             )
-        return pixels[..., [names.index(n) for n in self.channels]]
+        image = exr.of_channels(name, file, taken, variance=self._variance)
+        if waves:
+            taken = tuple(f"{nm:g}" for nm in sorted(waves))
+        self.channels = RGB if exr.is_rgb(taken) else taken
+        return image
 
 
 def _present(
@@ -284,4 +301,5 @@ def _variance(
     members = [archives.inside(file, base) for file in files]
     if len(files) < len(present) or any(m is None or m not in holder for m in members):
         raise FormatError(path, "variance must be there for all images or for none")
-    return named.ImageTextures(holder, [m for m in members if m], _Decode("linear", head.channels))
+    decode = _Decode(named.Decoder("linear", assumed=False), head.channels, variance=True)
+    return named.ImageTextures(holder, [m for m in members if m], decode)
