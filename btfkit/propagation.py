@@ -229,4 +229,5 @@ def _image(guidance: str | os.PathLike[str] | Array) -> tuple[Array, Any]:
     path = Path(guidance)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image")
-    return images.read(path.name, path.read_bytes(), transfer="srgb"), str(path)
+    image = images.decode(path.name, path.read_bytes(), transfer="srgb", assumed=True)
+    return image.linear, str(path)

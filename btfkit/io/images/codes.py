@@ -80,9 +80,7 @@ def _from_floats(name: str, values: Array, declared: Declared | None) -> Array:
     """Floats are linear, unless a profile says otherwise and they are codes in 0..1."""
     if declared is None:
         return np.ascontiguousarray(values)
-    curves = declared.curves or ()
-    share = np.linspace(0, 1, 256)
-    if any(np.abs(curve(share) - share).max() > 1e-3 for curve in curves):
+    if not declared.is_linear:
         if not ((values >= 0) & (values <= 1)).all():
             raise FormatError(
                 name, f"floats beyond 0..1 behind the curve of {declared.name}",

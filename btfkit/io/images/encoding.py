@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import struct
 import zlib
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +52,39 @@ def jpeg_with_profile(data: bytes, profile: bytes) -> bytes:
     if data[2:4] == b"\xff\xe0":
         at = 4 + struct.unpack_from(">H", data, 4)[0]
     return data[:at] + segments + data[at:]
+
+
+def write_tiff(
+    path: Path, pixels: NDArray[Any], *, alpha: bool, profile: bytes | None = None
+) -> None:
+    """Write (h, w, c) codes or floats as a TIFF, as they are.
+
+    Args:
+        path: of the file.
+        pixels: RGB or grey, alpha last.
+        alpha: whether there is alpha; colours are not multiplied by it.
+        profile: an ICC profile.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    import OpenImageIO as oiio
+
+    kinds = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float16": oiio.HALF}
+    h, w, c = pixels.shape
+    spec = oiio.ImageSpec(w, h, c, kinds.get(str(pixels.dtype), oiio.FLOAT))
+    spec.attribute("compression", "lzw")
+    if alpha:
+        spec.alpha_channel = c - 1
+        spec.attribute("oiio:UnassociatedAlpha", 1)
+    if profile is not None:
+        form = oiio.TypeDesc(f"uint8[{len(profile)}]")
+        spec.attribute("ICCProfile", form, np.frombuffer(profile, np.uint8))
+    out = oiio.ImageOutput.create(str(path))
+    if out is None or not out.open(str(path), spec):
+        raise OSError(f"{path}: cannot be written ({oiio.geterror()})")
+    if not (out.write_image(np.ascontiguousarray(pixels)) and out.close()):
+        raise OSError(f"{path}: cannot be written ({out.geterror()})")
 
 
 def _codes(linear: Array) -> NDArray[np.uint8]:

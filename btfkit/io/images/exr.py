@@ -172,7 +172,8 @@ def declared_by(name: str, attributes: Mapping[str, Any]) -> Declared | None:
         chromaticities: Chromaticities = values  # type: ignore[assignment]
         if len(values) != 8:
             raise ValueError("not eight")
-        return Declared("EXR chromaticities", None, from_primaries(chromaticities))
+        matrix = from_primaries(chromaticities)
+        return Declared("EXR chromaticities", None, matrix, chromaticities=chromaticities)
     except (TypeError, ValueError) as error:
         raise FormatError(
             name, f"chromaticities {str(given)[:80]} are none", remedy="save it without them"

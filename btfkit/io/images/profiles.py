@@ -39,12 +39,14 @@ class Declared:
             where the file does not say.
         matrix: (3, 3) from linear values to linear BT.709, D65; None where they are that.
         profile: the ICC profile, to be passed on.
+        chromaticities: to be passed on where the file says it so.
     """
 
     name: str
     curves: tuple[Curve, ...] | None = None
     matrix: Matrix | None = None
     profile: bytes | None = None
+    chromaticities: Chromaticities | None = None
 
     @functools.cached_property
     def srgb(self) -> bool:
@@ -70,9 +72,20 @@ class Declared:
 
     def encoded(self, linear: Floats) -> Floats:
         """(..., 3 or 1) code values, 0..1, of linear BT.709; clipped to what they can hold."""
-        own = linear if self.matrix is None else linear @ np.linalg.inv(self.matrix).T
         inverses = tuple(_inverse(curve) for curve in self.curves or ())
-        return self._through(np.clip(own, 0, 1), inverses)
+        return self._through(np.clip(self.in_own_primaries(linear), 0, 1), inverses)
+
+    def in_own_primaries(self, linear: Floats) -> Floats:
+        """(..., 3 or 1) linear values in the file's primaries of linear BT.709."""
+        if self.matrix is None or linear.shape[-1] != 3:
+            return linear
+        return linear @ np.linalg.inv(self.matrix).T.astype(linear.dtype)
+
+    @functools.cached_property
+    def is_linear(self) -> bool:
+        """Whether code values are proportional to light."""
+        x = np.linspace(0, 1, 256)
+        return all(np.abs(curve(x) - x).max() < _SAME_CURVE for curve in self.curves or ())
 
     def _through(self, values: Floats, curves: tuple[Curve, ...]) -> Floats:
         if not curves:

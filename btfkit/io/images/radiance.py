@@ -101,7 +101,8 @@ def _declared(name: str, header: bytes) -> Declared | None:
         if len(values) != 8:
             raise ValueError("not eight")
         chromaticities: Chromaticities = values
-        return Declared("Radiance PRIMARIES", None, from_primaries(chromaticities))
+        matrix = from_primaries(chromaticities)
+        return Declared("Radiance PRIMARIES", None, matrix, chromaticities=chromaticities)
     except ValueError as error:
         raise FormatError(
             name, f"PRIMARIES {lines[-1][:80].decode('latin-1')!r} are none; expected x and y of "
