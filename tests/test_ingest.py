@@ -118,10 +118,10 @@ CRASHES = """
         return work
     def resumed():
         decoded = []
-        read = images.read
+        decode = images.decode
         def counting(name, data, **options):
-            decoded.append(name); return read(name, data, **options)
-        images.read = counting
+            decoded.append(name); return decode(name, data, **options)
+        images.decode = counting
         journal = folder / ".a.btf.zarr.partial" / "journal.jsonl"
         lines = journal.read_bytes().split(b"\\n")[1:-1] if journal.exists() else []
         finished = sum(min(3, 10 - 3 * json.loads(line)["shard"]) for line in lines)

@@ -18,8 +18,14 @@ from numpy.typing import NDArray
 from btfkit import directions
 from btfkit.errors import FormatError
 
-_ANGLE = re.compile(r"(?<![A-Za-z])(tl|pl|tv|pv)[ _]?(-?\d+(?:\.\d+)?)", re.IGNORECASE)
-_NUMBER = re.compile(r"(\d{1,12}) ")
+# A number ends where the next key begins, or before anything that is no part of a number or word.
+_ANGLE = re.compile(
+    r"(?<![a-z])(tl|pl|tv|pv)[ _]?([-+]?\d+(?:[.,]\d+)?)(?=(?:tl|pl|tv|pv)[ _]?[-+\d]|[^a-z\d]|$)"
+    r"(?![.,+-]\d)",
+    re.IGNORECASE | re.ASCII,
+)
+_KEY = re.compile(r"(?<![a-z])(tl|pl|tv|pv)[ _]?[-+]?\d", re.IGNORECASE | re.ASCII)
+_NUMBER = re.compile(r"(\d{1,12}) ", re.ASCII)
 
 
 @final
@@ -35,13 +41,27 @@ class Angles:
 
 
 def parse(name: str) -> Angles | None:
-    """The angles in the base name of `name`; None unless all four are there, each once."""
+    """The angles in the base name of `name`; None unless all four are there, each once.
+
+    Decimals may have a point or a comma.
+
+    Raises:
+        FormatError: all four are there, and one is a number that goes on as something else.
+    """
     base = PurePosixPath(name.replace("\\", "/")).name
     stem = base.rsplit(".", 1)[0] if "." in base else base
-    found = _ANGLE.findall(stem)
-    angles = {key.lower(): float(value) for key, value in found}
-    if len(found) != 4 or len(angles) != 4:
+    keys = [key.lower() for key in _KEY.findall(stem)]
+    if len(keys) != 4 or len(set(keys)) != 4:
         return None
+    found = _ANGLE.findall(stem)
+    if len(found) != 4:
+        whole = {key.lower() for key, _ in found}
+        broken = next(key for key in keys if key not in whole)
+        raise FormatError(
+            name, f"the angle {broken} is not a number of its own; expected one like {broken}023.5",
+            remedy="rename the file",
+        )  # fmt: skip
+    angles = {key.lower(): float(value.replace(",", ".")) for key, value in found}
     number = _NUMBER.match(base)
     return Angles(**angles, number=int(number[1]) if number else -1)
 

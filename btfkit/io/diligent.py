@@ -94,7 +94,7 @@ def _images(holder: Archive, base: str) -> list[str]:
     listed = [line.strip() for line in lines if line.strip()]
     names = []
     for line in listed:
-        name = holder.locate(line, base)
+        name = holder.locate_image(line, base)
         if name is None:
             raise FormatError(holder.path, f"filenames.txt names {line!r}, which is not there")
         names.append(name)

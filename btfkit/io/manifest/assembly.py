@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +14,7 @@ import numpy as np
 from btfkit import colour
 from btfkit.btf import BTF, COLOUR, RGB
 from btfkit.errors import FormatError
-from btfkit.io import archive as archives
-from btfkit.io import images, named, spectral
+from btfkit.io import images, named, spectral, spelling
 from btfkit.io.archive import Archive
 from btfkit.io.images import Image, exr
 from btfkit.io.manifest.poses import MM, End, Pose
@@ -114,13 +114,12 @@ def assemble(path: Path, holder: Archive, base: str, head: Head, entries: Sequen
     Raises:
         FormatError: nothing there, a file outside the folder, or poses that do not fit.
     """
-    present, missing = _present(path, holder, base, entries)
+    present, files, missing = _present(path, holder, base, entries)
     light, light_mm = _ends(path, "light", [pose.light for pose in present])
     view, view_mm = _ends(path, "view", [pose.view or _ABOVE for pose in present])
     record = dict(head.record)
     if all(pose.view is None for pose in present):
         record["assumed"] = {**record["assumed"], "view": "from above"}
-    files = [archives.inside(pose.file, base) or "" for pose in present]
     codes = named.Decoder(head.transfer, assumed="transfer" in head.record["assumed"])
     decode = _Decode(codes, head.channels)
     plain = named.ImageTextures(holder, files, decode)
@@ -203,33 +202,36 @@ class _Decode:
 
 def _present(
     path: Path, holder: Archive, base: str, entries: Sequence[Pose]
-) -> tuple[list[Pose], int]:
-    """The poses whose images are there, and how many are not."""
+) -> tuple[list[Pose], list[str], int]:
+    """The poses whose images are there, the members that these are, and how many are not there."""
     if not entries:
         raise FormatError(path, "names no image")
-    files = [archives.inside(pose.file, base) for pose in entries]
-    for pose, file in zip(entries, files, strict=True):
-        if file is None:
-            raise FormatError(
-                path,
-                f"{pose.file!r} would leave the folder of the manifest",
-                remedy="put the manifest above its images",
-            )
-    seen: set[str | None] = set()
-    for file in files:
-        if file in seen:
-            raise FormatError(path, f"{file!r} is named twice", remedy="remove one")
-        seen.add(file)
-    there = [pose for pose, file in zip(entries, files, strict=True) if file and file in holder]
+    found = [_member(path, holder, base, pose.file) for pose in entries]
+    there = [(pose, file) for pose, file in zip(entries, found, strict=True) if file is not None]
+    again = [file for file, count in Counter(file for _, file in there).items() if count > 1]
+    if again:
+        raise FormatError(path, f"{again[0]!r} is named twice", remedy="remove one")
     missing = len(entries) - len(there)
     if not there:
         raise FormatError(path, f"none of the {len(entries)} images it names is there")
     if missing:
-        lost = next(file for file in files if not file or file not in holder)
+        lost = next(pose.file for pose, file in zip(entries, found, strict=True) if file is None)
         warnings.warn(
             f"{path}: {missing} of {len(entries)} images are missing, first {lost!r}", stacklevel=4
         )
-    return there, missing
+    return [pose for pose, _ in there], [file for _, file in there], missing
+
+
+def _member(path: Path, holder: Archive, base: str, name: str) -> str | None:
+    """The member that an entry means; a path of another machine by its last parts."""
+    elsewhere = spelling.is_absolute(name) and images.is_image(name.replace("\\", "/"))
+    if spelling.inside(name, base) is None and not elsewhere:
+        raise FormatError(
+            path,
+            f"{name!r} would leave the folder of the manifest",
+            remedy="put the manifest above its images",
+        )
+    return holder.locate_image(name, base)
 
 
 def _ends(path: Path, name: str, ends: Sequence[End]) -> tuple[Array, Array | None]:
@@ -298,8 +300,8 @@ def _variance(
     files = [pose.variance for pose in present if pose.variance is not None]
     if not files:
         return None
-    members = [archives.inside(file, base) for file in files]
-    if len(files) < len(present) or any(m is None or m not in holder for m in members):
+    members = [_member(path, holder, base, file) for file in files]
+    if len(files) < len(present) or None in members:
         raise FormatError(path, "variance must be there for all images or for none")
     decode = _Decode(named.Decoder("linear", assumed=False), head.channels, variance=True)
     return named.ImageTextures(holder, [m for m in members if m], decode)
