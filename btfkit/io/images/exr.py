@@ -153,8 +153,8 @@ def colours(name: str, names: Sequence[str]) -> tuple[str, ...]:
     if len(names) == 1 and names[0] not in ("A", "Z"):
         return (names[0],)
     raise FormatError(
-        name, f"channels {listing}; expected R, G and B, or Y",
-        remedy="name them in a manifest",
+        name, f"channels {listing}; expected R, G, B, or Y",
+        remedy="give its channels the names of their roles",
     )  # fmt: skip
 
 
