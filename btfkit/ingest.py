@@ -6,6 +6,7 @@ import hashlib
 import importlib.metadata
 import os
 import platform
+import shutil
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -14,6 +15,7 @@ from typing import Any, final
 
 from btfkit import io
 from btfkit.btf import BTF
+from btfkit.errors import FormatError
 from btfkit.files import refuse_existing
 from btfkit.io import archive
 from btfkit.io.store import reader as store
@@ -106,8 +108,11 @@ def ingest(
     record = replace(btf, provenance=provenance, history=history)
     path = writer.write(record, final, dtype=dtype, jobs=jobs, force=force, progress=progress)
     masked = store.masked_texels(path)
+    n, h, w, _ = btf.shape
+    if masked == n * h * w:
+        shutil.rmtree(path)
+        raise FormatError(source, f"none of {masked} texels is finite", remedy="look at its images")
     if masked:
-        n, h, w, _ = btf.shape
         warnings.warn(
             f"{os.fspath(source)}: {masked} of {n * h * w} texels are not finite; they are masked",
             stacklevel=2,

@@ -21,7 +21,7 @@ from btfkit.errors import FormatError
 # A number ends where the next key begins, or before anything that is no part of a number or word.
 _ANGLE = re.compile(
     r"(?<![a-z])(tl|pl|tv|pv)[ _]?([-+]?\d+(?:[.,]\d+)?)(?=(?:tl|pl|tv|pv)[ _]?[-+\d]|[^a-z\d]|$)"
-    r"(?![.,+-]\d)",
+    r"(?![.,+-]\d|[ _]\d(?!\d))",
     re.IGNORECASE | re.ASCII,
 )
 _KEY = re.compile(r"(?<![a-z])(tl|pl|tv|pv)[ _]?[-+]?\d", re.IGNORECASE | re.ASCII)
@@ -40,6 +40,11 @@ class Angles:
     number: int = -1
 
 
+def is_named(name: str) -> bool:
+    """Whether the base name of `name` has all four keys of angles, once each, whatever follows."""
+    return len(set(_keys(_stem(name)))) == len(_keys(_stem(name))) == 4
+
+
 def parse(name: str) -> Angles | None:
     """The angles in the base name of `name`; None unless all four are there, each once.
 
@@ -48,22 +53,29 @@ def parse(name: str) -> Angles | None:
     Raises:
         FormatError: all four are there, and one is a number that goes on as something else.
     """
-    base = PurePosixPath(name.replace("\\", "/")).name
-    stem = base.rsplit(".", 1)[0] if "." in base else base
-    keys = [key.lower() for key in _KEY.findall(stem)]
-    if len(keys) != 4 or len(set(keys)) != 4:
+    if not is_named(name):
         return None
+    stem = _stem(name)
     found = _ANGLE.findall(stem)
     if len(found) != 4:
         whole = {key.lower() for key, _ in found}
-        broken = next(key for key in keys if key not in whole)
+        broken = next(key for key in _keys(stem) if key not in whole)
         raise FormatError(
             name, f"the angle {broken} is not a number of its own; expected one like {broken}023.5",
             remedy="rename the file",
         )  # fmt: skip
     angles = {key.lower(): float(value.replace(",", ".")) for key, value in found}
-    number = _NUMBER.match(base)
+    number = _NUMBER.match(stem + " ")
     return Angles(**angles, number=int(number[1]) if number else -1)
+
+
+def _stem(name: str) -> str:
+    base = PurePosixPath(name.replace("\\", "/")).name
+    return base.rsplit(".", 1)[0] if "." in base else base
+
+
+def _keys(stem: str) -> list[str]:
+    return [key.lower() for key in _KEY.findall(stem)]
 
 
 def ordered(path: str, names: list[str]) -> list[tuple[str, Angles]]:

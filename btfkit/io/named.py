@@ -163,6 +163,8 @@ def assembled(
         btf = BTF(textures=textures, provenance=dict(provenance), **fields)
     except ValueError as error:
         raise FormatError(path, str(error)) from error
+    if btf.validity is not None and not btf.validity.any():
+        raise FormatError(path, "its mask leaves nothing valid", remedy="draw what counts in it")
     poses = [btf.light, btf.view, btf.light_position, btf.view_position]
     rows = np.concatenate([pose for pose in poses if pose is not None], axis=1)
     _, first, index = np.unique(rows, axis=0, return_index=True, return_inverse=True)
@@ -274,8 +276,7 @@ def looks_named(names: list[str], suffixes: set[str], *, spaces: bool) -> bool:
     """Whether one of the first images is named by angles, with or without spaces between."""
     candidates = [n for n in names if PurePosixPath(n).suffix.lower() in suffixes]
     for name in candidates[:20]:
-        angles = anglenames.parse(name)
-        if angles is not None:
+        if anglenames.is_named(name):
             return (" " in PurePosixPath(name).stem.strip()) == spaces
     return False
 

@@ -28,19 +28,20 @@ COLOUR = "spectral: one channel a wavelength in nm, linear"
 _WAVELENGTH = re.compile(r"(?:S0\.|T\.|[A-Za-z]*?)(\d{2,5}(?:[.,]\d+)?) *(?:nm)?", re.IGNORECASE)
 # A preview, alpha, depth, luminance, and Stokes components beyond the intensity.
 _BESIDE = re.compile(r"(?:.*\.)?(?:[RGBAYZ]|RY|BY)|S[123]\..*", re.IGNORECASE)
+# Headers that are looked at before none is taken to be readable.
+_LOOKS = 5
 _SHORTEST_NM, _LONGEST_NM = 100, 20000
 
 
 def detect(path: Path) -> bool:
-    """Whether EXRs named by angles have wavelengths for channels; reads one header."""
+    """Whether EXRs named by angles have wavelengths for channels; reads a header."""
     names = [n for n in archive.names_of(path) if PurePosixPath(n).suffix.lower() in SUFFIXES]
-    name = next((n for n in names if anglenames.parse(n)), None)
-    if name is None:
-        return False
-    try:
-        return bool(wavelengths(name, images.exr_channels(name, _bytes(path, name))))
-    except FormatError:
-        return False
+    for name in [n for n in names if anglenames.is_named(n)][:_LOOKS]:
+        try:
+            return bool(wavelengths(name, images.exr_channels(name, _bytes(path, name))))
+        except FormatError:
+            continue
+    return False
 
 
 def read(path: Path, *, cosine: str | None = None) -> BTF:

@@ -267,6 +267,14 @@ class ValueTextures(BonnTextures):
                 placed = np.maximum(np.cumsum(part) - 1, 0)
                 self._places[start : start + chunks.rows] = placed.reshape(part.shape)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Another process unpacks its own chunks.
+        return {n: v for n, v in self.__dict__.items() if n not in ("_lock", "_unpacked")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._lock, self._unpacked = threading.Lock(), OrderedDict()
+
     def _fill(self, pairs: Index, scale: Array, out: Array) -> None:
         rows, cols = self._grid.rows, self._grid.cols
         for number in np.unique(rows // self._chunks.rows):

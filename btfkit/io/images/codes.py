@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from btfkit import colour
 from btfkit.errors import FormatError
-from btfkit.io.images import exif, forks, headers, tiff
+from btfkit.io.images import exif, headers, tiff
 from btfkit.io.images.header import Header
 from btfkit.io.images.image import Array, Image
+from btfkit.io.images.libraries import opencv, openimageio
 from btfkit.io.images.profiles import Declared
 from btfkit.io.images.radiance import check_size
 
@@ -129,16 +130,6 @@ def _divided(
     return np.where(cover > 0, linear, np.float32(np.nan))
 
 
-@functools.cache
-def opencv() -> Any:
-    """OpenCV, which writes no errors of its own beside ours."""
-    import cv2
-
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    forks.guard()
-    return cv2
-
-
 def _by_opencv(name: str, data: bytes, header: Header) -> NDArray[Any]:
     """(h, w, c) as stored, RGB, alpha last."""
     cv2 = opencv()
@@ -180,9 +171,7 @@ def _by_openimageio(name: str, data: bytes, header: Header) -> NDArray[Any]:
 
 
 def _read_page(name: str, data: bytes, header: Header) -> NDArray[Any]:
-    import OpenImageIO as oiio
-
-    forks.guard()
+    oiio = openimageio()
     asked = oiio.ImageSpec()
     asked.attribute("oiio:UnassociatedAlpha", 1)
     # OpenImageIO's Python face opens names only.

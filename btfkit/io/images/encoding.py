@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from btfkit import colour
 from btfkit.io.images.image import Array
+from btfkit.io.images.libraries import opencv, openimageio
 
 _MOST_SEGMENT = 65535 - 2 - 14
 
 
 def encode_jpeg(linear: Array, *, quality: int = 100) -> bytes:
     """8-bit sRGB JPEG bytes of a linear (h, w, 1 or 3) picture, full chroma resolution."""
-    import cv2
-
+    cv2 = opencv()
     codes = _codes(linear)
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
     return _encoded(cv2.imencode(".jpg", codes, options))
@@ -27,8 +27,7 @@ def encode_jpeg(linear: Array, *, quality: int = 100) -> bytes:
 
 def encode_png(linear: Array) -> bytes:
     """8-bit sRGB PNG bytes of a linear (h, w, 1 or 3) picture."""
-    import cv2
-
+    cv2 = opencv()
     return _encoded(cv2.imencode(".png", _codes(linear)))
 
 
@@ -68,8 +67,7 @@ def write_tiff(
     Raises:
         OSError: the file cannot be written.
     """
-    import OpenImageIO as oiio
-
+    oiio = openimageio()
     kinds = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float16": oiio.HALF}
     h, w, c = pixels.shape
     spec = oiio.ImageSpec(w, h, c, kinds.get(str(pixels.dtype), oiio.FLOAT))

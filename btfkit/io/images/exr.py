@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.errors import FormatError
-from btfkit.io.images import exif, forks
+from btfkit.io.images import exif
 from btfkit.io.images.codes import said
 from btfkit.io.images.image import Array, Image
+from btfkit.io.images.libraries import openimageio
 from btfkit.io.images.profiles import BT709, Chromaticities, Declared, from_primaries, to_xyz
 from btfkit.io.images.radiance import check_size
 
@@ -235,8 +236,7 @@ def _label(spec: Any, index: int) -> str:
 
 
 def _pixels(name: str, source: Any, part: int, spec: Any, coded: int) -> Array:
-    import OpenImageIO as oiio
-
+    oiio = openimageio()
     check_size(name, spec.height, spec.width, spec.nchannels, coded=coded)
     source.seek_subimage(part, 0)
     pixels = source.read_image(oiio.FLOAT)
@@ -248,9 +248,7 @@ def _pixels(name: str, source: Any, part: int, spec: Any, coded: int) -> Array:
 
 def _with_exr(name: str, data: bytes, use: Callable[[Any], T]) -> T:
     """What `use` makes of the opened EXR."""
-    import OpenImageIO as oiio
-
-    forks.guard()
+    oiio = openimageio()
     if data[:4] != b"v/1\x01":
         raise FormatError(name, "not an EXR: the magic number is missing")
     # OpenImageIO's Python face opens names only.
@@ -312,8 +310,7 @@ def write_exr(
     Raises:
         OSError: the file cannot be written.
     """
-    import OpenImageIO as oiio
-
+    oiio = openimageio()
     half = values.dtype == np.float16
     h, w, c = values.shape
     spec = oiio.ImageSpec(w, h, c, oiio.HALF if half else oiio.FLOAT)
