@@ -82,12 +82,13 @@ def _from_floats(name: str, values: Array, declared: Declared | None) -> Array:
     if declared is None:
         return np.ascontiguousarray(values)
     if not declared.is_linear:
-        if not ((values >= 0) & (values <= 1)).all():
+        # What was divided by alpha may be a step of half above.
+        if ((values < 0) | (values > 1 + 2**-10)).any():
             raise FormatError(
                 name, f"floats beyond 0..1 behind the curve of {declared.name}",
                 remedy="save them as linear, with a linear profile or none",
             )  # fmt: skip
-        return np.asarray(declared.decoded(values), np.float32)
+        return np.asarray(declared.decoded(np.minimum(values, np.float32(1))), np.float32)
     return _converted(np.ascontiguousarray(values), declared)
 
 

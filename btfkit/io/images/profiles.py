@@ -18,7 +18,9 @@ Curve = Callable[[Floats], Floats]
 Chromaticities = tuple[float, float, float, float, float, float, float, float]
 
 # CIE 15:2004, 2 degrees.
-D65, D50 = (0.3127, 0.3290), (0.3457, 0.3585)
+D65 = (0.3127, 0.3290)
+# XYZ of the white of ICC profiles, to the digit that their headers have.
+_ICC_WHITE = np.array([0.9642, 1.0, 0.8249])
 # Where matrices or curves are that near, they are the same, rounded by whoever wrote them.
 _SAME_MATRIX, _SAME_CURVE = 2e-3, 1e-3
 # Source: Lam, "Metamerism and Colour Constancy", 1985 (Bradford), as in ICC.1:2010 annex E.
@@ -122,9 +124,9 @@ def to_xyz(chromaticities: Chromaticities) -> Matrix:
     return columns * np.linalg.solve(columns, _white(xy[3, 0], xy[3, 1]))
 
 
-def adapted(source: tuple[float, float], target: tuple[float, float]) -> Matrix:
-    """(3, 3) from XYZ under one white to XYZ under another (linear Bradford)."""
-    gains = (_CONES @ _white(*target)) / (_CONES @ _white(*source))
+def to_d65(white: NDArray[np.float64]) -> Matrix:
+    """(3, 3) from XYZ under a white (3,) to XYZ under D65 (linear Bradford)."""
+    gains = (_CONES @ _white(*D65)) / (_CONES @ white)
     return np.linalg.inv(_CONES) @ (gains[:, None] * _CONES)
 
 
@@ -139,13 +141,13 @@ def from_primaries(chromaticities: Chromaticities) -> Matrix | None:
     """
     xyz = to_xyz(chromaticities)
     if not np.allclose(chromaticities[:6], CIE_XYZ[:6], atol=1e-3):
-        xyz = adapted(chromaticities[6:], D65) @ xyz
+        xyz = to_d65(_white(*chromaticities[6:])) @ xyz
     return told_apart(colour.XYZ_TO_RGB @ xyz)
 
 
 def from_d50(columns: Matrix) -> Matrix | None:
     """(3, 3) to linear BT.709 from the D50 XYZ of red, green and blue, as ICC profiles hold."""
-    return told_apart(colour.XYZ_TO_RGB @ adapted(D50, D65) @ columns)
+    return told_apart(colour.XYZ_TO_RGB @ to_d65(_ICC_WHITE) @ columns)
 
 
 def told_apart(matrix: Matrix) -> Matrix | None:

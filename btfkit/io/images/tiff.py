@@ -21,7 +21,7 @@ from btfkit.io.images.profiles import D65, Chromaticities, Declared, from_primar
 _WIDTH, _HEIGHT, _BITS, _PHOTOMETRIC, _DESCRIPTION = 256, 257, 258, 262, 270
 _ORIENTATION, _SAMPLES, _EXTRA, _FORMAT, _SUBDIRECTORIES = 274, 277, 338, 339, 330
 _SUBFILE, _OLD_SUBFILE, _ICC, _DEPTH, _DNG = 254, 255, 34675, 32997, 50706
-_WHITE, _PRIMARIES, _COLOUR_MAP = 318, 319, 320
+_WHITE, _PRIMARIES, _COLOUR_MAP, _TILE_WIDTH = 318, 319, 320, 322
 _REDUCED_OR_MASK = 1 | 4
 _GREY_INVERTED, _GREY, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6
 _RAW = {32803: "a colour filter array", 34892: "linear sensor values"}
@@ -222,6 +222,11 @@ def _samples(name: str, directory: Directory) -> tuple[int, bool]:
         return 8, False
     if form == _CODES and stored in (10, 12, 14, 16):
         return 16, False
+    if form == _FLOATS and stored == 64 and _TILE_WIDTH in directory:
+        raise FormatError(
+            name, "holds floats of 64 bits in tiles, which OpenImageIO takes for others",
+            remedy="save it in strips, or as floats of 32 bits",
+        )  # fmt: skip
     if form == _FLOATS and stored in (16, 32, 64):
         return int(stored), True
     kind = {_CODES: "whole numbers", _SIGNED: "signed numbers", _FLOATS: "floats"}.get(
