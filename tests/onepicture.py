@@ -67,8 +67,7 @@ def _materialgan(folder: Path, suffix: str, data: bytes) -> Path:
 
 READERS: dict[str, Reader] = {
     "ubo2003": Reader(_named("00000 tl000 pl000 tv000 pv000"), (".png", ".jpg", ".hdr")),
-    # EXRs of UTIA are XYZ where they declare nothing: a law of their own.
-    "utia": Reader(_named("tl000_pl000_tv000_pv000"), (".png", ".jpg")),
+    "utia": Reader(_named("tl000_pl000_tv000_pv000"), (".png", ".jpg", ".exr")),
     "manifest": Reader(_manifest, ANY),
     "lp": Reader(_lp, ANY),
     "diligent": Reader(_diligent, ANY, assumes="linear", colours=3),

@@ -57,6 +57,8 @@ def test_every_reader_gives_what_the_writer_of_the_picture_meant(
         patch.setattr(pictures, "SIZE", (7, 7) if reader.square else (6, 9))
         made = data.draw(pictures.any_picture())
     channels = made.truth.shape[2]
+    # EXRs of UTIA are XYZ where they declare nothing: tested beside its writer.
+    assume((name, made.suffix) != ("utia", ".exr"))
     assume(made.suffix in reader.suffixes and channels == (reader.colours or channels))
     with warnings.catch_warnings():
         # What was converted or is in doubt is told; here it is looked at.

@@ -48,7 +48,7 @@ def decode(name: str, data: bytes, *, transfer: str, assumed: bool) -> Image:
     if alpha is not None and header.premultiplied:
         linear = _divided(name, colours, alpha, header, transfer, assumed)
     depth = np.dtype(colours.dtype)
-    return Image(linear, alpha, depth, header.declared)
+    return Image(linear, alpha, depth, header.declared, doubt=header.doubt)
 
 
 def _linear(name: str, values: NDArray[Any], header: Header, transfer: str, assumed: bool) -> Array:
@@ -198,7 +198,10 @@ def _read_page(name: str, data: bytes, header: Header) -> NDArray[Any]:
     # OpenImageIO turns 8 bits around by itself.
     if tiff.inverted(data, header.page) and values.dtype != np.uint8:
         if values.dtype.kind == "f":
-            raise FormatError(name, "holds floats of which 0 is white; expected 0 to be black")
+            raise FormatError(
+                name, "holds floats of which 0 is white; expected 0 to be black",
+                remedy="save it the other way around",
+            )  # fmt: skip
         values[..., 0] = np.iinfo(values.dtype).max - values[..., 0]
     return values
 

@@ -24,6 +24,7 @@ class Header:
         declared: what the colours mean; None where the file does not say.
         end: bytes behind it are none of the picture's; None for all.
         page: which picture of the file it is.
+        doubt: what cannot be known of the colours; empty without one.
     """
 
     h: int
@@ -37,3 +38,4 @@ class Header:
     declared: Declared | None = None
     end: int | None = None
     page: int = 0
+    doubt: str = ""

@@ -71,6 +71,7 @@ def describe(name: str, data: bytes) -> Header:
         h, w, colours=1 if components == 1 else 3, bits=8,
         orientation=exif.orientation_of(meta[0]) if meta else 1,
         declared=_declared(name, blocks, meta, components), end=at,
+        doubt="inks (CMYK) are mixed without a profile" if components == 4 else "",
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from btfkit.io import images
 def read_mask(name: str, data: bytes) -> tuple[NDArray[np.bool_], str]:
     """(h, w) bool, and how it was taken.
 
-    Where alpha differs and colours do not, alpha is the mask; else the colours are, and of alpha
+    Where alpha differs, or is 0, and colours do not differ, alpha is the mask; else the colours are, and of alpha
     only where it is 0. Anything but 0 counts, be the bright value 1, 100 or 255; of a JPEG, whose
     blocks ring, what is above half of its brightest value.
 
@@ -23,7 +23,7 @@ def read_mask(name: str, data: bytes) -> tuple[NDArray[np.bool_], str]:
     bright = np.nan_to_num(image.linear.max(axis=2))
     alpha = image.alpha
     held = alpha is not None and np.ptp(alpha) > 0
-    if alpha is not None and held and np.ptp(bright) == 0:
+    if alpha is not None and np.ptp(bright) == 0 and (held or not alpha.any()):
         mask, how = alpha > 0, "alpha other than 0"
     elif data.startswith(b"\xff\xd8"):
         mask, how = bright > bright.max() / 2, "brighter than half of the brightest (JPEG)"

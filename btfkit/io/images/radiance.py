@@ -46,7 +46,9 @@ def decode(name: str, data: bytes, *, orientation: str = "standard") -> Image:
     if data[:2] != b"#?" or match is None:
         raise FormatError(name, "not a Radiance picture: no resolution line after the header")
     if b"FORMAT=32-bit_rle_xyze" in data[:blank]:
-        raise FormatError(name, "the Radiance picture holds XYZ; expected RGB")
+        raise FormatError(
+            name, "the Radiance picture holds XYZ; expected RGB", remedy="convert it: ra_xyze -r"
+        )
     first_sign, first, count, second_sign, second, length = match.groups()
     scanlines, pixels = int(count), int(length)
     gains = _gains(name, data[:blank])

@@ -234,7 +234,7 @@ def _samples(name: str, directory: Directory) -> tuple[int, bool]:
     )
     raise FormatError(
         name, f"pixels are {kind} of {stored} bits; expected codes of 8 or 16 bits, or floats of "
-        "16, 32 or 64",
+        "16, 32 or 64", remedy="save it as one of these",
     )  # fmt: skip
 
 
