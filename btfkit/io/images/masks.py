@@ -12,9 +12,9 @@ from btfkit.io import images
 def read_mask(name: str, data: bytes) -> tuple[NDArray[np.bool_], str]:
     """(h, w) bool, and how it was taken.
 
-    Where alpha differs, or is 0, and colours do not differ, alpha is the mask; else the colours are, and of alpha
-    only where it is 0. Anything but 0 counts, be the bright value 1, 100 or 255; of a JPEG, whose
-    blocks ring, what is above half of its brightest value.
+    Where alpha differs, or is 0, and colours do not differ, alpha is the mask; else the colours
+    are, and of alpha only where it is 0. Anything but 0 counts, be the bright value 1, 100 or 255;
+    of a JPEG, whose blocks ring, what is above half of its brightest value.
 
     Raises:
         FormatError: no picture, or one in which nothing counts.
