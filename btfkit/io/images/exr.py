@@ -99,14 +99,16 @@ def of_channels(
         variance: whether values are variances: of a mixture its squared weights count.
     """
     values, names, attributes = file
-    declared = declared_by(name, attributes) if is_rgb(taken) or _is_chroma(taken) else None
+    coloured = is_rgb(taken) or _is_chroma(taken)
+    declared = declared_by(name, attributes) if coloured else None
     picked = values[..., [names.index(channel) for channel in taken]]
     if _is_chroma(taken):
         picked = _from_chroma(picked, attributes)
     if declared is not None and declared.matrix is not None:
         weights = declared.matrix**2 if variance else declared.matrix
         picked = np.asarray(picked @ weights.T.astype(np.float32), np.float32)
-    alpha = next((n for n in names if n == _prefix(taken[0]) + "A" and n not in taken), None)
+    covered = coloured or tuple(taken) == ("Y",)
+    alpha = next((n for n in names if covered and n == _prefix(taken[0]) + "A"), None)
     beside = tuple(n for n in names if n not in taken and n != alpha)
     cover = None if alpha is None else values[..., names.index(alpha)]
     depth = np.dtype(np.float16 if attributes[_DEPTH] == "half" else np.float32)
