@@ -276,3 +276,16 @@ def test_ingesting_holds_no_more_than_a_shard_and_a_few_textures_a_worker(
     tracemalloc.stop()
     # Per worker: a shard of four half textures, its encoded copy, one float32 texture and masks.
     assert peak < 2 * 8 * texture
+
+
+def test_textures_without_a_value_are_stored_like_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A shard of them alone: Zarr leaves chunks of its fill value out where it may.
+    monkeypatch.setattr(writer, "_SHARD_BYTES", 1)
+    textures = np.random.default_rng(0).random((3, 4, 5, 3)).astype(np.float32)
+    textures[1] = np.nan
+    light = directions.bonn81()[[1, 2, 3]].astype(np.float32)
+    btf = BTF(textures=textures, light=light, view=np.broadcast_to(np.float32([0, 0, 1]), (3, 3)))
+    back = btfkit.open(writer.write(btf, tmp_path / "a.btf.zarr", dtype="float32"))
+    np.testing.assert_array_equal(back.textures.batch(range(3)), textures)
