@@ -17,6 +17,7 @@ import xarray
 import zarr
 
 import btfkit
+from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import BtfkitError, FormatError
 from btfkit.io.store import reader, writer
