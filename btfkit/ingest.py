@@ -6,6 +6,7 @@ import hashlib
 import importlib.metadata
 import os
 import platform
+import shutil
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -14,7 +15,9 @@ from typing import Any, final
 
 from btfkit import io
 from btfkit.btf import BTF
+from btfkit.errors import FormatError
 from btfkit.files import refuse_existing
+from btfkit.io import archive
 from btfkit.io.store import reader as store
 from btfkit.io.store import writer
 
@@ -112,8 +115,11 @@ def ingest(
     told("reading and writing")
     path = writer.write(record, final, dtype=dtype, jobs=jobs, force=force, progress=progress)
     masked = store.masked_texels(path)
+    n, h, w, _ = btf.shape
+    if masked == n * h * w:
+        shutil.rmtree(path)
+        raise FormatError(source, f"none of {masked} texels is finite", remedy="look at its images")
     if masked:
-        n, h, w, _ = btf.shape
         warnings.warn(
             f"{os.fspath(source)}: {masked} of {n * h * w} texels are not finite; they are masked",
             stacklevel=2,
@@ -124,14 +130,14 @@ def ingest(
 def source_hash(source: Path) -> dict[str, Any]:
     """SHA-256 that tells a source from another, and what it was taken of.
 
-    A file is hashed whole up to 1 GiB, beyond that by its ends and size; a folder by the
-    names and sizes of its files.
+    A file is hashed whole up to 1 GiB, beyond that by its ends and size; a folder by the names and
+    sizes of its files, without hidden ones and stores: the output may grow in it.
     """
     digest = hashlib.sha256()
     if source.is_dir():
-        files = sorted(p for p in source.rglob("*") if p.is_file())
-        for each in files:
-            entry = f"{each.relative_to(source).as_posix()}\0{each.stat().st_size}\n"
+        files = sorted(archive.names_of(source))
+        for name in files:
+            entry = f"{name}\0{(source / name).stat().st_size}\n"
             digest.update(entry.encode("utf-8", "surrogateescape"))
         return {"sha256": digest.hexdigest(), "of": "names and sizes", "files": len(files)}
     size = source.stat().st_size

@@ -243,25 +243,11 @@ def _image(guidance: str | os.PathLike[str] | Array) -> tuple[Array, Any]:
     path = Path(guidance)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image")
-    data = path.read_bytes()
-    image = images.read(path.name, data, transfer="srgb")
-    alpha = _alpha(path, data)
-    if alpha is not None and image.shape[2] in (1, 3):
-        image = np.concatenate([image, alpha[..., None]], axis=2)
-    return image, str(path)
-
-
-def _alpha(path: Path, data: bytes) -> Array | None:
-    """(h, w) alpha of a picture of integer codes, 0..1; None where it has none, or all is 1."""
-    if path.suffix.lower() not in (".png", ".tif", ".tiff"):
-        return None
-    import cv2
-
-    codes: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if codes is None or codes.ndim != 3 or codes.shape[2] != 4 or codes.dtype.kind != "u":
-        return None
-    alpha = codes[..., 3] / np.float32(np.iinfo(codes.dtype).max)
-    return None if (alpha == 1).all() else alpha.astype(np.float32)
+    image = images.decode(path.name, path.read_bytes(), transfer="srgb", assumed=True)
+    alpha = image.coverage
+    if alpha is None:
+        return image.linear, str(path)
+    return np.concatenate([image.linear, alpha[..., None]], axis=2), str(path)
 
 
 def _opaque(image: Array) -> Array:

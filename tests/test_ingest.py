@@ -118,10 +118,10 @@ CRASHES = """
         return work
     def resumed():
         decoded = []
-        read = images.read
+        decode = images.decode
         def counting(name, data, **options):
-            decoded.append(name); return read(name, data, **options)
-        images.read = counting
+            decoded.append(name); return decode(name, data, **options)
+        images.decode = counting
         journal = folder / ".a.btf.zarr.partial" / "journal.jsonl"
         lines = journal.read_bytes().split(b"\\n")[1:-1] if journal.exists() else []
         finished = sum(min(3, 10 - 3 * json.loads(line)["shard"]) for line in lines)
@@ -368,3 +368,49 @@ def test_the_source_is_recorded_with_its_hash_and_what_was_given(tmp_path: Path)
     file.write_bytes(file.read_bytes() + b"\0")
     again = ingest(path, tmp_path / "b.btf.zarr")
     assert btfkit.open(again).provenance["hash"]["sha256"] != recorded["hash"]["sha256"]
+
+
+@pytest.mark.parametrize("place", ["beside", "inside"])
+def test_a_run_goes_on_wherever_its_output_lies(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer, "_SHARD_BYTES", 3 * 16 * 16 * 3 * 2)
+    source = many(tmp_path / "scans", 16, 5, 4)
+    monkeypatch.chdir(source if place == "inside" else tmp_path)
+    given = "." if place == "inside" else "scans"
+
+    def stop(done: int, total: int) -> None:
+        if done >= 9:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ingest(given, jobs=1, progress=stop)
+    decoded: list[str] = []
+    decode = images.decode
+
+    def counting(name: str, data: bytes, **options: Any) -> images.Image:
+        decoded.append(name)
+        return decode(name, data, **options)
+
+    monkeypatch.setattr(images, "decode", counting)
+    path = ingest(given, jobs=1)
+    # Three or four of seven shards were done; the first image is looked at once more.
+    assert len(decoded) <= 20 - 9 + 1
+    btf = btfkit.open(path)
+    assert len(btf) == 20
+    assert btf.provenance["hash"]["files"] == 21
+    with pytest.raises(FileExistsError):
+        ingest(given)
+    ingest(given, force=True)
+    assert len(btfkit.open(path)) == 20
+
+
+def test_a_source_of_nothing_but_holes_is_an_error_and_leaves_no_store(tmp_path: Path) -> None:
+    for tl in (15, 30):
+        images.write_exr(
+            tmp_path / f"tl{tl:03d}_pl000_tv000_pv000.exr",
+            np.full((4, 4, 3), np.nan, np.float32), ("R", "G", "B"),
+        )  # fmt: skip
+    with pytest.raises(BtfkitError, match="none of 32 texels is finite; look at its images"):
+        ingest(tmp_path, tmp_path / "a.btf.zarr", options={"exr_colour": "rgb"})
+    assert not (tmp_path / "a.btf.zarr").exists()

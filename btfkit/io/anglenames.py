@@ -18,8 +18,14 @@ from numpy.typing import NDArray
 from btfkit import directions
 from btfkit.errors import FormatError
 
-_ANGLE = re.compile(r"(?<![A-Za-z])(tl|pl|tv|pv)[ _]?(-?\d+(?:\.\d+)?)", re.IGNORECASE)
-_NUMBER = re.compile(r"(\d{1,12}) ")
+# A number ends where the next key begins, or before anything that is no part of a number or word.
+_ANGLE = re.compile(
+    r"(?<![a-z])(tl|pl|tv|pv)[ _]?([-+]?\d+(?:[.,]\d+)?)(?=(?:tl|pl|tv|pv)[ _]?[-+\d]|[^a-z\d]|$)"
+    r"(?![.,+-]\d|[ _]\d(?!\d))",
+    re.IGNORECASE | re.ASCII,
+)
+_KEY = re.compile(r"(?<![a-z])(tl|pl|tv|pv)[ _]?[-+]?\d", re.IGNORECASE | re.ASCII)
+_NUMBER = re.compile(r"(\d{1,12}) ", re.ASCII)
 
 
 @final
@@ -34,16 +40,42 @@ class Angles:
     number: int = -1
 
 
+def is_named(name: str) -> bool:
+    """Whether the base name of `name` has all four keys of angles, once each, whatever follows."""
+    return len(set(_keys(_stem(name)))) == len(_keys(_stem(name))) == 4
+
+
 def parse(name: str) -> Angles | None:
-    """The angles in the base name of `name`; None unless all four are there, each once."""
-    base = PurePosixPath(name.replace("\\", "/")).name
-    stem = base.rsplit(".", 1)[0] if "." in base else base
-    found = _ANGLE.findall(stem)
-    angles = {key.lower(): float(value) for key, value in found}
-    if len(found) != 4 or len(angles) != 4:
+    """The angles in the base name of `name`; None unless all four are there, each once.
+
+    Decimals may have a point or a comma.
+
+    Raises:
+        FormatError: all four are there, and one is a number that goes on as something else.
+    """
+    if not is_named(name):
         return None
-    number = _NUMBER.match(base)
+    stem = _stem(name)
+    found = _ANGLE.findall(stem)
+    if len(found) != 4:
+        whole = {key.lower() for key, _ in found}
+        broken = next(key for key in _keys(stem) if key not in whole)
+        raise FormatError(
+            name, f"the angle {broken} is not a number of its own; expected one like {broken}023.5",
+            remedy="rename the file",
+        )  # fmt: skip
+    angles = {key.lower(): float(value.replace(",", ".")) for key, value in found}
+    number = _NUMBER.match(stem + " ")
     return Angles(**angles, number=int(number[1]) if number else -1)
+
+
+def _stem(name: str) -> str:
+    base = PurePosixPath(name.replace("\\", "/")).name
+    return base.rsplit(".", 1)[0] if "." in base else base
+
+
+def _keys(stem: str) -> list[str]:
+    return [key.lower() for key in _KEY.findall(stem)]
 
 
 def ordered(path: str, names: list[str]) -> list[tuple[str, Angles]]:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import functools
 import os
-import posixpath
 import stat
 import threading
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.errors import FormatError
+from btfkit.io import numerals, spelling
+from btfkit.io.images import is_image
 
 # One member of more bytes than this is no image of a sample.
 _MOST_BYTES = 1 << 31
@@ -24,7 +25,9 @@ _MOST_BYTES = 1 << 31
 _MOST_RATIO = 200
 # A manifest of 300 000 images.
 MOST_TEXT = 1 << 26
-_IGNORED = {"thumbs.db", ".ds_store", "desktop.ini"}
+_BYTE_ORDER_MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+# General purpose bit 11 of a zip: names are UTF-8.
+_UTF8 = 1 << 11
 
 
 @final
@@ -35,30 +38,55 @@ class Archive:
         path: folder or zip file.
 
     Raises:
-        FormatError: a damaged zip, or one with members that leave it or stand in it twice.
+        FormatError: a damaged zip, or one with members that leave it.
 
-    A link inside a folder may not lead out of it either: `read` refuses it.
+    What is wrong with one member shows when it is read: a link that leads out, a name that stands
+    in the zip twice, bytes that unpack to absurdly many. Names may differ from those of members in
+    case, composition (Unicode) and separators. It can be pickled and used from forked processes.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._local = threading.local()
         self._zip = not path.is_dir()
+        self._twice: set[str] = set()
         self._infos = self._checked() if self._zip else {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Open files stay behind; another process opens its own.
+        return {name: value for name, value in self.__dict__.items() if name != "_local"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._local = threading.local()
 
     @functools.cached_property
     def names(self) -> list[str]:
         """All members, sorted."""
         if self._zip:
             return sorted(self._infos)
-        return sorted(name for name in _files(self.path) if _counts(PurePosixPath(name)))
+        return sorted(_files(self.path))
 
     def __contains__(self, name: str) -> bool:
+        return self._member(name) is not None
+
+    def _member(self, name: str) -> str | None:
+        """The member of that name, spelt like it or not; None where there is none."""
+        if self._there(name):
+            return name
+        found = self._by_key.get(spelling.key(name), [])
+        if len(found) > 1:
+            raise FormatError(
+                self.path, f"{name!r} may be any of {', '.join(found[:3])}", remedy="rename them"
+            )
+        return found[0] if found else None
+
+    def _there(self, name: str) -> bool:
         if self._zip:
             return name in self._infos
         try:
             return (self.path / name).is_file()
-        except OSError:  # a name longer than any file's
+        except (OSError, ValueError):  # a name longer than any file's, or with a null
             return False
 
     def read(self, name: str) -> bytes:
@@ -67,12 +95,16 @@ class Archive:
         Raises:
             FormatError: missing, damaged, encrypted, larger than it says, or outside.
         """
+        member = self._member(name)
+        if member is None:
+            raise FormatError(self.path / name, "the file has gone since it was listed")
         if not self._zip:
-            return self._read_file(self.path / name)
-        info = self._infos[name]
+            return self._read_file(self.path / member)
+        info = self._infos[member]
+        self._check_member(member, info)
         try:
-            with self._file().open(info) as member:
-                data = member.read(info.file_size + 1)
+            with self._file().open(info) as packed:
+                data = packed.read(info.file_size + 1)
         except (
             zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError,
             NotImplementedError, ValueError,
@@ -90,24 +122,23 @@ class Archive:
         return data
 
     def text(self, name: str) -> str:
-        """A member as text, UTF-8 or else Latin-1.
+        """A member as text: UTF-16 where it starts with its mark, UTF-8, or else Latin-1.
 
         Raises:
             FormatError: binary, or far too long for a text that somebody wrote.
         """
-        size = self._infos[name].file_size if self._zip else (self.path / name).stat().st_size
+        member = self._member(name) or name
+        size = self._infos[member].file_size if self._zip else (self.path / member).stat().st_size
         if size > MOST_TEXT:
             raise FormatError(self.path / name, f"{size} bytes of text; at most {MOST_TEXT}")
-        data = self.read(name)
-        if b"\0" in data:
-            raise FormatError(self.path / name, "not a text file")
+        data = self.read(member)
         try:
-            return data.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            return data.decode("latin-1")
+            return decoded(data)
+        except ValueError as error:
+            raise FormatError(self.path / name, "not a text file") from error
 
     def table(self, name: str, columns: int, *, comments: str = "") -> NDArray[np.float64]:
-        """(rows, columns) numbers of a text member, separated by commas or white space.
+        """(rows, columns) numbers of a text member, as `numerals.numbers` takes a line.
 
         Args:
             name: of the member.
@@ -118,18 +149,14 @@ class Archive:
             FormatError: a line that has not so many finite numbers, or no line at all.
         """
         rows = []
-        for number, line in enumerate(self.text(name).splitlines(), 1):
-            words = line.replace(",", " ").split()
-            if not words or words[0][0] in comments:
+        for count, line in enumerate(self.text(name).splitlines(), 1):
+            plain = line.strip()
+            if not plain.strip(",;") or plain[0] in comments:
                 continue
-            try:
-                # Python reads 1_5 as 15.
-                row = [] if "_" in line else [float(word) for word in words]
-            except ValueError:
-                row = []
-            if len(row) != columns or not np.isfinite(row).all():
+            row = numerals.numbers(plain, columns)
+            if row is None:
                 raise FormatError(
-                    self.path / name, f"line {number} is {line[:60]!r}; expected {columns} numbers"
+                    self.path / name, f"line {count} is {line[:60]!r}; expected {columns} numbers"
                 )
             rows.append(row)
         if not rows:
@@ -140,17 +167,31 @@ class Archive:
         """The member that a text file means by a name; None where there is none.
 
         Args:
-            name: relative to `base`, or a path of another machine, whose last part counts.
+            name: relative to `base`, or a path of another machine: then the member that shares its
+                last part counts, and among several the one that shares most folders with it.
             base: folder of the text file, "" for the archive itself.
 
         Raises:
-            FormatError: several members have that last part.
+            FormatError: several members are meant equally.
         """
-        plain = name.replace("\\", "/")
-        relative = inside(plain, base)
-        if relative is not None and relative in self:
-            return relative
-        found = self._by_last.get(PurePosixPath(plain).name.lower(), [])
+        relative = spelling.inside(name, base)
+        member = self._member(relative) if relative is not None else None
+        if member is not None:
+            return member
+        last = spelling.key(name).rsplit("/", 1)[-1]
+        return self._the_one(name, self._by_last.get(last, []))
+
+    def locate_image(self, name: str, base: str = "") -> str | None:
+        """As `locate`; where there is no such file, the image of another suffix that it became."""
+        member = self.locate(name, base)
+        if member is not None or not is_image(name.replace("\\", "/")):
+            return member
+        stem = PurePosixPath(spelling.key(name)).stem
+        others = [m for m in self._by_stem.get(stem, []) if is_image(m)]
+        return self._the_one(str(PurePosixPath(name.replace("\\", "/")).with_suffix("")), others)
+
+    def _the_one(self, name: str, members: list[str]) -> str | None:
+        found = spelling.closest(name, members)
         if len(found) > 1:
             raise FormatError(
                 self.path, f"{name!r} may be any of {', '.join(found[:3])}", remedy="rename them"
@@ -158,12 +199,17 @@ class Archive:
         return found[0] if found else None
 
     @functools.cached_property
+    def _by_key(self) -> dict[str, list[str]]:
+        return _grouped(self.names, lambda key: key)
+
+    @functools.cached_property
     def _by_last(self) -> dict[str, list[str]]:
         """Members by the last part of their names."""
-        members: dict[str, list[str]] = {}
-        for member in self.names:
-            members.setdefault(PurePosixPath(member).name.lower(), []).append(member)
-        return members
+        return _grouped(self.names, lambda key: key.rsplit("/", 1)[-1])
+
+    @functools.cached_property
+    def _by_stem(self) -> dict[str, list[str]]:
+        return _grouped(self.names, lambda key: PurePosixPath(key).stem)
 
     def _read_file(self, path: Path) -> bytes:
         try:
@@ -192,37 +238,60 @@ class Archive:
                 self.path, f"not a readable zip ({error})", remedy="copy the archive again"
             ) from error
         for info in members:
-            name = PurePosixPath(info.filename.replace("\\", "/"))
+            plain = _zip_name(info).replace("\\", "/")
+            name = PurePosixPath(plain)
             # ZipInfo.is_dir fails on an empty name.
-            if info.filename[-1:] in ("", "/") or not _counts(name):
+            if plain[-1:] in ("", "/") or not spelling.all_count(name):
                 continue
             if name.is_absolute() or ".." in name.parts or (name.parts and ":" in name.parts[0]):
                 raise FormatError(self.path, f"member {info.filename!r} would leave the archive")
-            if stat.S_ISLNK(info.external_attr >> 16):
-                raise FormatError(
-                    self.path,
-                    f"member {info.filename!r} is a link",
-                    remedy="pack the files that links lead to",
-                )
             if str(name) in infos:
-                raise FormatError(
-                    self.path, f"member {info.filename!r} stands in the archive twice"
-                )
-            if info.file_size > max(1 << 20, min(_MOST_BYTES, _MOST_RATIO * info.compress_size)):
-                raise FormatError(
-                    self.path,
-                    f"member {info.filename!r} says it unpacks from {info.compress_size} "
-                    f"to {info.file_size} bytes",
-                )
+                self._twice.add(str(name))
             infos[str(name)] = info
         return infos
 
+    def _check_member(self, name: str, info: zipfile.ZipInfo) -> None:
+        """Refuse a member that is not what its name says: one link, one of two, or far too much."""
+        if stat.S_ISLNK(info.external_attr >> 16):
+            raise FormatError(
+                self.path, f"member {name!r} is a link", remedy="pack the files that links lead to"
+            )
+        if name in self._twice:
+            raise FormatError(
+                self.path, f"member {name!r} stands in the archive twice", remedy="pack it anew"
+            )
+        if info.file_size > max(1 << 20, min(_MOST_BYTES, _MOST_RATIO * info.compress_size)):
+            raise FormatError(
+                self.path,
+                f"member {name!r} says it unpacks from {info.compress_size} "
+                f"to {info.file_size} bytes",
+                remedy="unpack the archive and read the folder, if that is true",
+            )
+
     def _file(self) -> zipfile.ZipFile:
-        # A ZipFile of each thread's own: they share no lock and no file position.
-        if not hasattr(self._local, "file"):
+        # A ZipFile of each thread's and process's own: a forked child shares its parent's position
+        # in the file.
+        if getattr(self._local, "process", None) != os.getpid():
             self._local.file = zipfile.ZipFile(self.path)
+            self._local.process = os.getpid()
         file: zipfile.ZipFile = self._local.file
         return file
+
+
+def decoded(data: bytes, errors: str = "strict") -> str:
+    """Text of bytes: UTF-16 where it starts with its mark, UTF-8, or else Latin-1.
+
+    Raises:
+        ValueError: binary.
+    """
+    if data[:2] in _BYTE_ORDER_MARKS:
+        return data.decode(_BYTE_ORDER_MARKS[data[:2]], errors)
+    if b"\0" in data:
+        raise ValueError("binary")
+    try:
+        return data.decode("utf-8-sig", errors)
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
 
 
 def names_of(path: Path) -> list[str]:
@@ -232,41 +301,61 @@ def names_of(path: Path) -> list[str]:
     try:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as file:
-                return [info.filename for info in file.infolist()]
+                names = [_zip_name(info).replace("\\", "/") for info in file.infolist()]
+            return [name for name in names if spelling.all_count(PurePosixPath(name))]
     except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError):
         return []
     return []
 
 
-def inside(name: str, base: str = "") -> str | None:
-    """`name`, relative to `base`, as a member's name; None where it leaves the archive."""
-    plain = posixpath.join(base, name.replace("\\", "/"))
-    relative = posixpath.normpath(plain)
-    leaves = relative.startswith(("/", "../")) or relative in ("..", ".") or "\0" in relative
-    return None if leaves or ":" in relative.split("/")[0] else relative
-
-
 def folder_with(names: list[str], *required: str) -> str | None:
     """The folder of a listing that holds all the `required` files; the highest of several."""
-    present = {PurePosixPath(name.replace("\\", "/")) for name in names}
-    folders = {path.parent for path in present if path.name == required[0]}
-    found = [f for f in folders if all(f / name in present for name in required)]
+    folders: dict[PurePosixPath, set[str]] = {}
+    for name in names:
+        path = PurePosixPath(name.replace("\\", "/"))
+        folders.setdefault(path.parent, set()).add(spelling.key(path.name))
+    wanted = {spelling.key(name) for name in required}
+    found = [folder for folder, files in folders.items() if wanted <= files]
     if not found:
         return None
     best = min(found, key=lambda folder: (len(folder.parts), str(folder)))
     return "" if best == PurePosixPath(".") else str(best)
 
 
+def _grouped(names: list[str], by: Callable[[str], str]) -> dict[str, list[str]]:
+    """Names by some part of their keys."""
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(by(spelling.key(name)), []).append(name)
+    return groups
+
+
+def _zip_name(info: zipfile.ZipInfo) -> str:
+    """The name of a member; where nothing is said of its encoding, UTF-8 if it is that.
+
+    Python takes it for code page 437, which macOS never writes.
+    """
+    if info.flag_bits & _UTF8:
+        return info.filename
+    try:
+        return info.filename.encode("cp437").decode("utf-8")
+    except UnicodeError:
+        return info.filename
+
+
 def _files(folder: Path) -> Iterator[str]:
     """Relative names of all files below a folder, links to files included, those to folders not.
 
-    The disk is asked for listings alone, not about each of 20 000 images.
+    What lies behind a link to a folder inside is listed where it lies. Hidden files, litter and
+    stores are left out. The disk is asked for listings alone, not about each of 20 000 images.
     """
     pending = [""]
     while pending:
         base = pending.pop()
         with os.scandir(folder / base) as entries:
             for entry in entries:
+                if not spelling.counts(entry.name):
+                    continue
                 if entry.is_dir(follow_symlinks=False):
                     pending.append(f"{base}{entry.name}/")
                 elif _is_file(entry):
@@ -278,7 +367,3 @@ def _is_file(entry: os.DirEntry[str]) -> bool:
         return entry.is_file()
     except OSError:  # a link that leads to itself
         return False
-
-
-def _counts(path: Path | PurePosixPath) -> bool:
-    return path.name.lower() not in _IGNORED and "__MACOSX" not in path.parts

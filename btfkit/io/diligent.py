@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.io import archive as archives
-from btfkit.io import images, named
+from btfkit.io import named
 from btfkit.io.archive import Archive
+from btfkit.io.images.masks import read_mask
 from btfkit.io.lp import y_sign
-from btfkit.textures import Array
 
 _REQUIRED = ("light_directions.txt", "light_intensities.txt", "filenames.txt")
 
@@ -68,26 +68,25 @@ def read(
     intensity = _rows(holder, str(folder / "light_intensities.txt"), len(names))
     if (intensity <= 0).any():
         raise FormatError(path, "light_intensities.txt holds one that is not above 0")
-    cosines = named.cosine_factor(values["cosine"], light)
-
-    def decode(name: str, data: bytes) -> Array:
-        return images.read(name, data, transfer=values["transfer"])
-
-    def scale(index: int, h: int, w: int) -> Array:
-        factor = (1 / intensity[index]).astype(np.float32)
-        return factor if cosines is None else factor * cosines(index, h, w)
-
-    textures = named.ImageTextures(holder, names, decode, scale)
+    scale = named.Product(
+        named.Gains((1 / intensity).astype(np.float32)),
+        named.cosine_factor(values["cosine"], light),
+    )
+    textures = named.ImageTextures(holder, names, named.Decoder.of(values, record), scale)
     if textures.shape[3] != 3:
         raise FormatError(path / names[0], f"{textures.shape[3]} channels; expected 3")
+    validity, how = _mask(holder, str(folder / "mask.png"), textures.shape[1:3])
     return named.assembled(
         path,
         textures,
         light=light,
         view=np.broadcast_to([0.0, 0.0, 1.0], light.shape),
-        validity=_mask(holder, str(folder / "mask.png"), textures.shape[1:3]),
-        provenance={"source": str(path), "format": "diligent", **record},
-    )
+        validity=validity,
+        provenance={
+            "source": str(path), "format": "diligent", **record,
+            **({"mask": how} if how else {}),
+        },
+    )  # fmt: skip
 
 
 def _images(holder: Archive, base: str) -> list[str]:
@@ -95,7 +94,7 @@ def _images(holder: Archive, base: str) -> list[str]:
     listed = [line.strip() for line in lines if line.strip()]
     names = []
     for line in listed:
-        name = holder.locate(line, base)
+        name = holder.locate_image(line, base)
         if name is None:
             raise FormatError(holder.path, f"filenames.txt names {line!r}, which is not there")
         names.append(name)
@@ -113,11 +112,13 @@ def _rows(holder: Archive, name: str, n: int) -> NDArray[np.float64]:
     return rows
 
 
-def _mask(holder: Archive, name: str, size: tuple[int, ...]) -> NDArray[np.bool_] | None:
-    """(1, h, w) bool; None without a mask."""
+def _mask(
+    holder: Archive, name: str, size: tuple[int, ...]
+) -> tuple[NDArray[np.bool_], str] | tuple[None, None]:
+    """(1, h, w) bool and how it was taken; None without a mask."""
     if name not in holder:
-        return None
-    mask = images.read(name, holder.read(name), transfer="linear").max(axis=2) > 0.5
+        return None, None
+    mask, how = read_mask(str(holder.path / name), holder.read(name))
     if mask.shape != size:
         raise FormatError(holder.path / name, f"the mask is {mask.shape}; the images are {size}")
-    return mask[None]
+    return mask[None], how

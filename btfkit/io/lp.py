@@ -19,12 +19,9 @@ import numpy as np
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.io import archive as archives
-from btfkit.io import images, named
+from btfkit.io import named, numerals
 from btfkit.io.archive import Archive
-from btfkit.textures import Array
 
-_BETWEEN = " \t,;"
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _SHORTEST = 1e-4
 
 
@@ -62,7 +59,7 @@ def read(
     holder, file = _found(path)
     entries = parse(str(path), holder.text(file))
     base = str(PurePosixPath(file).parent)
-    located = [(holder.locate(name, base), light) for name, light in entries]
+    located = [(holder.locate_image(name, base), light) for name, light in entries]
     present = [(name, light) for name, light in located if name is not None]
     if not present:
         raise FormatError(path, f"none of the {len(entries)} images it names is there")
@@ -79,10 +76,7 @@ def read(
     light = np.array([light for _, light in present])
     light[:, 1] *= y_sign(values["orientation"])
     view = np.broadcast_to([0.0, 0.0, 1.0], light.shape)
-
-    def decode(name: str, data: bytes) -> Array:
-        return images.read(name, data, transfer=values["transfer"])
-
+    decode = named.Decoder.of(values, record)
     return named.assembled(
         path,
         named.ImageTextures(
@@ -110,10 +104,11 @@ def parse(path: str, text: str) -> list[tuple[str, list[float]]]:
     count = int(lines[0].strip(" ,;"))
     entries = []
     for number, line in enumerate(lines[1:], 2):
-        name, numbers = _split(line)
-        if not name or not all(map(_is_number, numbers)):
+        parts = numerals.named_numbers(line, 3)
+        if parts is None or not parts[0]:
             raise FormatError(path, f"line {number} is {line[:60]!r}; expected: file x y z")
-        vector = np.array([float(each) for each in numbers])
+        name, numbers = parts
+        vector = np.array(numbers)
         length = float(np.linalg.norm(vector))
         if not _SHORTEST <= length < np.inf:
             raise FormatError(path, f"line {number}: {vector.tolist()} is not a direction")
@@ -128,24 +123,6 @@ def parse(path: str, text: str) -> list[tuple[str, list[float]]]:
     return entries
 
 
-def _split(line: str) -> tuple[str, list[str]]:
-    """A name, which may hold separators itself, and the last three words.
-
-    From the right, one pass: an expression for the whole line would go through it over and over.
-    """
-    rest, words = line, []
-    for _ in range(3):
-        rest = rest.rstrip(_BETWEEN)
-        cut = max(rest.rfind(each) for each in _BETWEEN) + 1
-        words.append(rest[cut:])
-        rest = rest[:cut]
-    return rest.rstrip(_BETWEEN), words[::-1]
-
-
-def _is_number(word: str) -> bool:
-    return len(word) < 64 and _NUMBER.fullmatch(word) is not None
-
-
 def y_sign(orientation: str) -> int:
     """1 where y runs up, -1 where it runs down the rows."""
     signs = {"y_up": 1, "y_down": -1}
@@ -155,7 +132,7 @@ def y_sign(orientation: str) -> int:
 
 
 def _light_files(names: list[str]) -> list[str]:
-    return [n for n in names if n.lower().endswith(".lp") and "__MACOSX" not in n]
+    return [n for n in names if n.lower().endswith(".lp")]
 
 
 def _found(path: Path) -> tuple[Archive, str]:

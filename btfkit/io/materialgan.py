@@ -71,11 +71,7 @@ def read(path: Path, *, transfer: str | None = None, cosine: str | None = None) 
     )
     if values["cosine"] not in ("in", "out"):
         raise ValueError(f"cosine {values['cosine']!r}; expected in or out")
-
-    def decode(name: str, data: bytes) -> Array:
-        return images.read(name, data, transfer=values["transfer"])
-
-    plain = named.ImageTextures(holder, names, decode)
+    plain = named.ImageTextures(holder, names, named.Decoder.of(values, record))
     _, h, w, c = plain.shape
     if c != 3:
         raise FormatError(path / names[0], f"{c} channels; expected 3")

@@ -17,10 +17,10 @@ from btfkit.errors import FormatError
 from btfkit.io import anglenames, images
 from btfkit.io.anglenames import Angles
 from btfkit.io.archive import Archive
-from btfkit.io.images import radiance
+from btfkit.io.images import Image
 from btfkit.textures import Array, Textures
 
-Decode = Callable[[str, bytes], Array]
+Decode = Callable[[str, bytes], Image]
 # Pair, h and w to factors that broadcast against (h, w, c).
 Scale = Callable[[int, int, int], Array]
 
@@ -32,8 +32,11 @@ class ImageTextures(Textures):
     Args:
         archive: where the members lie.
         names: (n,) members.
-        decode: name and bytes to (h, w, c) float32.
+        decode: name and bytes to a picture.
         scale: what the values of a pair are multiplied by, or None.
+
+    Attributes:
+        found: what the first image says of itself, for the record.
 
     Raises:
         FormatError: the first member cannot be decoded; its size is everybody's.
@@ -44,7 +47,8 @@ class ImageTextures(Textures):
     ) -> None:
         self._archive, self._names, self._decode, self._scale = archive, names, decode, scale
         first = decode(names[0], archive.read(names[0]))
-        self.shape = (len(names), *first.shape)
+        self.shape = (len(names), *first.linear.shape)
+        self.found = first.said
 
     def scaled(self, scale: Scale) -> ImageTextures:
         """The same members with other factors; nothing is decoded."""
@@ -54,7 +58,7 @@ class ImageTextures(Textures):
 
     def _read(self, index: int) -> Array:
         name = self._names[index]
-        image = self._decode(name, self._archive.read(name))
+        image = self._decode(name, self._archive.read(name)).linear
         if image.shape != self.shape[1:]:
             raise FormatError(
                 self._archive.path / name,
@@ -82,7 +86,7 @@ def read_named(
 
     Args:
         path: folder or zip.
-        decode: name and bytes to linear values.
+        decode: name and bytes to a picture.
         suffixes: of the images; other members are left alone.
         cosine: "in" where the data hold the cosine of the light, "out" where it is divided out.
         channels: names, asked for once the first image is decoded; None takes RGB or Y by the
@@ -147,6 +151,9 @@ def assembled(
     Raises:
         FormatError: the parts do not fit, a direction is none, or a pair is there twice.
     """
+    found = textures.found if isinstance(textures, ImageTextures) else {}
+    if found:
+        provenance = _told(path, provenance, found)
     if fields.get("channels") is None:
         c = textures.shape[3]
         if c not in (1, 3):
@@ -156,6 +163,8 @@ def assembled(
         btf = BTF(textures=textures, provenance=dict(provenance), **fields)
     except ValueError as error:
         raise FormatError(path, str(error)) from error
+    if btf.validity is not None and not btf.validity.any():
+        raise FormatError(path, "its mask leaves nothing valid", remedy="draw what counts in it")
     poses = [btf.light, btf.view, btf.light_position, btf.view_position]
     rows = np.concatenate([pose for pose in poses if pose is not None], axis=1)
     _, first, index = np.unique(rows, axis=0, return_index=True, return_inverse=True)
@@ -170,14 +179,59 @@ def assembled(
     return btf
 
 
+def _told(path: Path, provenance: Mapping[str, Any], found: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The record with what the first image declares; what no longer has to be assumed goes."""
+    record = {**provenance, "found": dict(found)}
+    assumed = dict(provenance.get("assumed", {}))
+    if found.get("curve") and assumed.pop("transfer", None) is not None:
+        record["assumed"] = assumed
+    if "colour" in found and "converted" in found:
+        warnings.warn(
+            f"{path}: the images declare {found['colour']}; they are converted to linear BT.709",
+            stacklevel=4,
+        )
+    if "doubt" in found:
+        warnings.warn(f"{path}: in the first image {found['doubt']}", stacklevel=4)
+    return record
+
+
 def cosine_factor(cosine: str, light: np.ndarray[Any, Any]) -> Scale | None:
     """What puts the cosine of far lights (n, 3) into values; None where it is in them."""
     if cosine == "in":
         return None
     if cosine != "out":
         raise ValueError(f"cosine {cosine!r}; expected in or out")
-    factors = np.maximum(directions.normalize(light)[:, 2], 0).astype(np.float32)
-    return lambda index, h, w: factors[index]
+    return Gains(np.maximum(directions.normalize(light)[:, 2:], 0).astype(np.float32))
+
+
+@final
+class Product:
+    """Several scales one after the other; None counts as 1.
+
+    Args:
+        scales: each (pair, h, w) to factors.
+        power: of their product.
+    """
+
+    def __init__(self, *scales: Scale | None, power: int = 1) -> None:
+        self._scales, self._power = [each for each in scales if each is not None], power
+
+    def __call__(self, index: int, h: int, w: int) -> Array:
+        factor = np.ones((1, 1, 1), np.float32)
+        for scale in self._scales:
+            factor = factor * scale(index, h, w)
+        return factor**self._power
+
+
+@final
+class Gains:
+    """Factors (n, 1 or c) of the pairs."""
+
+    def __init__(self, gains: Array) -> None:
+        self._gains = gains
+
+    def __call__(self, index: int, h: int, w: int) -> Array:
+        return self._gains[index]
 
 
 def assumptions(**options: tuple[Any, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -222,18 +276,34 @@ def looks_named(names: list[str], suffixes: set[str], *, spaces: bool) -> bool:
     """Whether one of the first images is named by angles, with or without spaces between."""
     candidates = [n for n in names if PurePosixPath(n).suffix.lower() in suffixes]
     for name in candidates[:20]:
-        angles = anglenames.parse(name)
-        if angles is not None:
+        if anglenames.is_named(name):
             return (" " in PurePosixPath(name).stem.strip()) == spaces
     return False
 
 
-def decode_image(transfer: str, orientation: str = "standard") -> Decode:
-    """A decoder with its options bound."""
+@final
+class Decoder:
+    """Images of one source to linear colour.
 
-    def decode(name: str, data: bytes) -> Array:
-        if data[:2] == b"#?":
-            return radiance.read(name, data, orientation=orientation)
-        return images.read(name, data, transfer=transfer)
+    Args:
+        transfer: what integer codes mean.
+        assumed: whether nobody said so: then the curve that a file declares comes first.
+        orientation: of Radiance pictures.
+    """
 
-    return decode
+    def __init__(self, transfer: str, *, assumed: bool, orientation: str = "standard") -> None:
+        self._transfer, self._assumed, self._orientation = transfer, assumed, orientation
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any], record: Mapping[str, Any]) -> Decoder:
+        """As `assumptions` settled it."""
+        return cls(values["transfer"], assumed="transfer" in record["assumed"])
+
+    def __call__(self, name: str, data: bytes) -> Image:
+        return images.decode(
+            name,
+            data,
+            transfer=self._transfer,
+            assumed=self._assumed,
+            orientation=self._orientation,
+        )

@@ -10,31 +10,38 @@ from __future__ import annotations
 
 import re
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
+from typing import final
+
+import numpy as np
 
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.io import anglenames, archive, images, named
 from btfkit.io.archive import Archive
-from btfkit.textures import Array
+from btfkit.io.images import Image
 
 SUFFIXES = {".exr"}
 COLOUR = "spectral: one channel a wavelength in nm, linear"
 # 400, 400.0, 400nm, w400, and S0.400,00nm of the spectral EXR layout by Fichet et al. 2021.
 _WAVELENGTH = re.compile(r"(?:S0\.|T\.|[A-Za-z]*?)(\d{2,5}(?:[.,]\d+)?) *(?:nm)?", re.IGNORECASE)
+# A preview, alpha, depth, luminance, and Stokes components beyond the intensity.
+_BESIDE = re.compile(r"(?:.*\.)?(?:[RGBAYZ]|RY|BY)|S[123]\..*", re.IGNORECASE)
+# Headers that are looked at before none is taken to be readable.
+_LOOKS = 5
 _SHORTEST_NM, _LONGEST_NM = 100, 20000
 
 
 def detect(path: Path) -> bool:
-    """Whether EXRs named by angles have wavelengths for channels; reads one header."""
+    """Whether EXRs named by angles have wavelengths for channels; reads a header."""
     names = [n for n in archive.names_of(path) if PurePosixPath(n).suffix.lower() in SUFFIXES]
-    name = next((n for n in names if anglenames.parse(n)), None)
-    if name is None:
-        return False
-    try:
-        return bool(_order(images.exr_channels(name, _bytes(path, name))))
-    except FormatError:
-        return False
+    for name in [n for n in names if anglenames.is_named(n)][:_LOOKS]:
+        try:
+            return bool(wavelengths(name, images.exr_channels(name, _bytes(path, name))))
+        except FormatError:
+            continue
+    return False
 
 
 def read(path: Path, *, cosine: str | None = None) -> BTF:
@@ -50,39 +57,73 @@ def read(path: Path, *, cosine: str | None = None) -> BTF:
     values, record = named.assumptions(
         cosine=(cosine, "in"), scale=(None, "as stored: 1 is a white diffuser")
     )
-    wanted: list[dict[float, str]] = []
-
-    def decode(name: str, data: bytes) -> Array:
-        pixels, channels, _ = images.read_exr(name, data)
-        order = _order(channels)
-        if not order:
-            raise FormatError(name, f"channels {', '.join(channels[:6])}; expected wavelengths")
-        if not wanted:
-            wanted.append(order)
-        if order.keys() != wanted[0].keys():
-            raise FormatError(name, "has other wavelengths than the first image")
-        return pixels[..., [channels.index(order[nm]) for nm in sorted(order)]]
-
+    decode = Decoder()
     return named.read_named(
         path,
         decode,
         suffixes=SUFFIXES,
         cosine=values["cosine"],
-        channels=lambda: tuple(f"{nm:g}" for nm in sorted(wanted[0])),
+        channels=lambda: decode.channels,
         colour=COLOUR,
         provenance={"format": "spectral", **record},
     )
 
 
-def _order(channels: tuple[str, ...]) -> dict[float, str]:
-    """Channel of each wavelength; empty unless every channel is one, each once."""
+@final
+class Decoder:
+    """EXRs to their wavelengths, ascending: those of the first, which all others must have.
+
+    Attributes:
+        channels: wavelengths in nm, once the first is decoded.
+    """
+
+    def __init__(self) -> None:
+        self.channels: tuple[str, ...] = ()
+
+    def __call__(self, name: str, data: bytes) -> Image:
+        pixels, channels, _ = images.read_exr(name, data)
+        order = wavelengths(name, channels)
+        if not order:
+            raise FormatError(name, f"channels {', '.join(channels[:6])}; expected wavelengths")
+        names = tuple(f"{nm:g}" for nm in sorted(order))
+        self.channels = self.channels or names
+        if names != self.channels:
+            raise FormatError(name, "has other wavelengths than the first image")
+        taken = [order[nm] for nm in sorted(order)]
+        beside = tuple(c for c in channels if c not in taken)
+        values = pixels[..., [channels.index(channel) for channel in taken]]
+        return Image(values, None, np.dtype(np.float32), None, beside)
+
+
+def wavelengths(name: str, channels: Sequence[str]) -> dict[float, str]:
+    """The channel of each wavelength, nm; empty without any.
+
+    A preview in RGB, alpha, depth and the further Stokes components are no wavelengths and are left
+    out.
+
+    Raises:
+        FormatError: a wavelength twice, or beside wavelengths a channel that is nothing known.
+    """
     order: dict[float, str] = {}
+    strange = []
     for channel in channels:
         match = _WAVELENGTH.fullmatch(channel.strip())
         nm = float(match[1].replace(",", ".")) if match else 0.0
-        if not _SHORTEST_NM <= nm <= _LONGEST_NM or nm in order:
-            return {}
-        order[nm] = channel
+        if _SHORTEST_NM <= nm <= _LONGEST_NM:
+            if nm in order:
+                raise FormatError(
+                    name, f"channels {order[nm]} and {channel} are one wavelength",
+                    remedy="save the one that is meant",
+                )  # fmt: skip
+            order[nm] = channel
+        elif not _BESIDE.fullmatch(channel.strip()):
+            strange.append(channel)
+    if order and strange:
+        raise FormatError(
+            name, f"has wavelengths and channels {', '.join(strange[:6])}; expected wavelengths, "
+            "and at most a preview in RGB, alpha and depth",
+            remedy="save the wavelengths by themselves",
+        )  # fmt: skip
     return order
 
 

@@ -56,7 +56,11 @@ def read(
     )
     return named.read_named(
         path,
-        named.decode_image(values["transfer"], values["orientation"]),
+        named.Decoder(
+            values["transfer"],
+            assumed="transfer" in record["assumed"],
+            orientation=values["orientation"],
+        ),
         suffixes=SUFFIXES,
         cosine=values["cosine"],
         number=_running_number,

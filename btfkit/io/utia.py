@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from btfkit.errors import FormatError
 from btfkit.files import whole_folder
 from btfkit.io import archive, images, named
 from btfkit.io.archive import Archive
+from btfkit.io.images import Image, exr
+from btfkit.io.images.profiles import CIE_XYZ
 from btfkit.textures import Array
 
 SUFFIXES = {".png", ".exr", ".jpg", ".jpeg"}
@@ -59,15 +61,11 @@ def read(
     if values["exr_colour"] not in ("xyz", "rgb"):
         raise ValueError(f"exr_colour {values['exr_colour']!r}; expected xyz or rgb")
 
-    def decode(name: str, data: bytes) -> Array:
-        if not name.lower().endswith(".exr"):
-            return images.read(name, data, transfer=values["transfer"])
-        pixels, channels, _ = images.read_exr(name, data)
-        if len(channels) < 3:
-            raise FormatError(name, f"channels {channels}; expected three")
-        rgb = pixels[..., :3]
-        return colour.xyz_to_rgb(rgb) if values["exr_colour"] == "xyz" else rgb
-
+    decode = _Decoder(
+        named.Decoder.of(values, record),
+        xyz=values["exr_colour"] == "xyz",
+        assumed="exr_colour" in record["assumed"],
+    )
     moved: dict[str, Any] = {}
 
     def relit(light: Array, view: Array) -> Array:
@@ -86,6 +84,35 @@ def read(
         provenance={"format": "utia", **record},
     )
     return replace(btf, provenance={**btf.provenance, **moved})
+
+
+@final
+class _Decoder:
+    """Code values by the decoder of all formats; EXRs as XYZ or RGB.
+
+    Args:
+        codes: of everything but EXRs.
+        xyz: whether R, G and B of an EXR hold XYZ. assumed: whether nobody said so: then what an
+            EXR declares comes first.
+    """
+
+    def __init__(self, codes: named.Decoder, *, xyz: bool, assumed: bool) -> None:
+        self._codes, self._xyz, self._assumed = codes, xyz, assumed
+
+    def __call__(self, name: str, data: bytes) -> Image:
+        if not name.lower().endswith(".exr"):
+            return self._codes(name, data)
+        file = pixels, channels, _ = images.read_exr(name, data)
+        named_xyz = {"X", "Y", "Z"} <= set(channels)
+        taken = ("X", "Y", "Z") if named_xyz else exr.colours(name, channels)
+        if len(taken) != 3:
+            raise FormatError(name, f"channels {', '.join(channels)}; expected three of colour")
+        image = exr.of_channels(name, file, taken)
+        if image.declared is not None and self._assumed and not image.declared.is_xyz:
+            return image
+        stored = pixels[..., [channels.index(channel) for channel in taken]]
+        linear = colour.xyz_to_rgb(stored) if named_xyz or self._xyz else stored
+        return replace(image, linear=linear, declared=None)
 
 
 def _shifted(light: Array, view: Array, table: Path) -> tuple[Array, list[int]]:
@@ -145,7 +172,7 @@ def write(
             texture = btf.texture(pair)
             if exr:
                 xyz = colour.rgb_to_xyz(texture).astype(np.float16)
-                images.write_exr(file, xyz, ("R", "G", "B"))
+                images.write_exr(file, xyz, ("R", "G", "B"), chromaticities=CIE_XYZ)
             else:
                 file.write_bytes(images.encode_png(lost.count(texture)))
             if progress:

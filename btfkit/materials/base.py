@@ -115,6 +115,10 @@ class Material(ABC):
             f"{size / 1e6:.2f} MB)"
         )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # What kernels made of the weights they make again in the other process.
+        return type(self), (self.spec, self.weights, self.header)
+
     @classmethod
     @abstractmethod
     def shapes(cls, spec: Any, header: Header) -> dict[str, tuple[int, ...]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, final
+from typing import Any, ClassVar, final
 
 from btfkit.materials.base import Array, Header, Material
 from btfkit.queries import Query
@@ -47,7 +47,10 @@ class TracedRelief(Material):
             provenance=dict(relief.provenance),
         )
         super().__init__(spec or TracedSpec(), {}, header)
-        self._geometry = geometry(relief)
+        self._relief, self._geometry = relief, geometry(relief)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self._relief, self.spec)
 
     @classmethod
     def shapes(cls, spec: TracedSpec, header: Header) -> dict[str, tuple[int, ...]]:

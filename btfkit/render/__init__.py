@@ -1,1 +1,5 @@
 """Pictures of a material on simple shapes."""
+
+from btfkit.shapes import obj
+
+__all__ = ["obj"]

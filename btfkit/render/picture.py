@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from btfkit.errors import FormatError
 from btfkit.files import whole
 from btfkit.io import images
+from btfkit.render import surroundings
 from btfkit.render.preview import Rendering
 
 Array = NDArray[np.float32]
@@ -23,32 +23,18 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 def read_surroundings(path: Path, *, channels: Sequence[str]) -> Array:
-    """Radiance (h, w, c) of a lat-long picture for a material's channels.
+    """Radiance (h, w, c) by latitude and longitude for a material's channels.
 
-    A material of three channels takes R, G and B; any other the luminance in every channel.
-    Values that are negative or not finite count as 0 and are warned of.
+    A material of three channels takes R, G and B; any other the luminance in every channel. What
+    is not finite or negative, and square probes, are treated as `surroundings` says.
 
     Raises:
-        FormatError: neither *.hdr nor *.exr, damaged, or without R, G and B.
+        FormatError: neither *.hdr nor *.exr, damaged, without colour, or in another projection.
     """
-    suffix, data = path.suffix.lower(), path.read_bytes()
-    if suffix == ".exr":
-        values, names, _ = images.read_exr(os.fspath(path), data)
-        if len(names) > 1 and names[:3] != ("R", "G", "B"):
-            raise FormatError(path, f"channels {', '.join(names[:6])}; expected R, G, B or one")
-        values = values[..., :3]
-    elif suffix == ".hdr":
-        values = images.read(os.fspath(path), data, transfer="linear")
-    else:
+    if path.suffix.lower() not in (".exr", ".hdr"):
         raise FormatError(path, "surroundings are *.hdr or *.exr")
-    bad = ~np.isfinite(values) | (values < 0)
-    if bad.any():
-        warnings.warn(
-            f"{path}: {int(bad.sum())} of {bad.size} values are negative or not finite; "
-            "they count as 0",
-            stacklevel=2,
-        )
-        values = np.where(bad, np.float32(0), values)
+    image = images.decode(os.fspath(path), path.read_bytes(), transfer="linear")
+    values = surroundings.as_panorama(path, surroundings.cleaned(path, image.linear))
     if values.shape[2] == len(channels):
         return values
     grey = values @ _LUMINANCE if values.shape[2] == 3 else values[..., 0]

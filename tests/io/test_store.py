@@ -17,6 +17,7 @@ import xarray
 import zarr
 
 import btfkit
+from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import BtfkitError, FormatError
 from btfkit.io.store import reader, writer
@@ -332,3 +333,16 @@ def test_an_abrdf_reads_each_texture_once_and_its_neighbours_none(
     for col in range(7):
         btf.abrdf(2, col)
     assert sorted(read) == [0, 1, 2, 3, 4]
+
+
+def test_textures_without_a_value_are_stored_like_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A shard of them alone: Zarr leaves chunks of its fill value out where it may.
+    monkeypatch.setattr(writer, "_SHARD_BYTES", 1)
+    textures = np.random.default_rng(0).random((3, 4, 5, 3)).astype(np.float32)
+    textures[1] = np.nan
+    light = directions.bonn81()[[1, 2, 3]].astype(np.float32)
+    btf = BTF(textures=textures, light=light, view=np.broadcast_to(np.float32([0, 0, 1]), (3, 3)))
+    back = btfkit.open(writer.write(btf, tmp_path / "a.btf.zarr", dtype="float32"))
+    np.testing.assert_array_equal(back.textures.batch(range(3)), textures)

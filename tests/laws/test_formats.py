@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sources
+from notunderstood import REFUSED
+from onepicture import READERS
 
 import btfkit
 from btfkit import directions, io
@@ -141,6 +143,24 @@ def test_concurrent_reads_equal_serial_ones(name: str, source: Callable[[str], P
         together = list(pool.map(btf.texture, pairs))
     for pair, texture in zip(pairs, together, strict=True):
         np.testing.assert_array_equal(texture, btf.texture(pair))
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_the_header_declares_and_the_reader_does_not_understand_is_refused(
+    reader: str, case: str, tmp_path: Path
+) -> None:
+    refused = REFUSED[case]
+    if refused.suffix not in READERS[reader].suffixes:
+        # A reader does not see pictures that its format does not have.
+        assert refused.suffix not in io.format_module(reader).__dict__.get("SUFFIXES", ())
+        return
+    path = READERS[reader].make(tmp_path, refused.suffix, refused.data())
+    with pytest.raises(FormatError, match=refused.message) as caught:
+        btfkit.open(path, format=reader)
+    # The picture is named, and what to do.
+    assert refused.suffix in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 # A store hands on the provenance that it was given.

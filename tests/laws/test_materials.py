@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import pickle
 import subprocess
 import sys
 import warnings
@@ -87,6 +89,23 @@ def test_a_model_says_what_it_is_of(model: str) -> None:
     assert material.header.channels == btf.channels
     assert material.header.wrap == "wrap"
     assert material.header.steps >= 1
+
+
+def _answers(material: Material) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    rgb, _ = material.evaluate(rng.random((9, 2)), upper(rng, 9), upper(rng, 9))
+    return rgb
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")
+@every_model
+def test_pickled_and_forked_a_material_answers_the_same(model: str) -> None:
+    material = fitted(model)
+    expected = _answers(material)
+    np.testing.assert_array_equal(_answers(pickle.loads(pickle.dumps(material))), expected)
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        found = pool.apply_async(_answers, (material,)).get(60)
+    np.testing.assert_array_equal(found, expected)
 
 
 @every_model

@@ -699,7 +699,7 @@ def test_polygons_negative_indices_and_continued_lines_are_read(tmp_path: Path) 
 @pytest.mark.parametrize(("text", "message"), [
     ("", "no faces"),
     (TRIANGLE + "f 1 2 3\n", r"1 of 1 triangles have no texture coordinates.*unwrap"),
-    (TRIANGLE + "f 1/1 2/2\n", r"line 7: a face of 2 corners"),
+    (TRIANGLE + "f 1/1 2/2\n", r"no faces .* of 3 corners or more"),
     (TRIANGLE + "f 1/1 2/2 9/3\n", r"names v 9; there are 3"),
     (TRIANGLE + "f 1/1 2/2 3/9\n", r"names vt 9; there are 3"),
     (TRIANGLE + "f 0/1 2/2 3/3\n", r"line 7: corner '0/1'"),

@@ -203,10 +203,10 @@ class ViewTextures(BonnTextures):
             part = np.empty((len(members), *out.shape[1:]), np.float32)
             one = np.ones(len(members), np.float32)
             _filled(factors, grid, width, lights, one, False, part)
-            part += self._means(
+            means = self._means(
                 factors, lights[:, None, None], width * grid.rows[:, None] + grid.cols
             )
-            out[members] = part * scale[members, None, None, None]
+            out[members] = _added(part, means, scale[members, None, None, None])
 
     def _pick(self, pairs: Index, scale: Array, rows: Index, cols: Index) -> Array:
         out = np.empty((len(pairs), self.shape[3]), np.float32)
@@ -215,8 +215,8 @@ class ViewTextures(BonnTextures):
             factors = self._layout.factors[view]
             one = np.ones(len(members), np.float32)
             part = _picked(factors, self.shape[3], lights, texels[members], one, False)
-            part += self._means(factors, lights, texels[members])
-            out[members] = part * scale[members, None]
+            means = self._means(factors, lights, texels[members])
+            out[members] = _added(part, means, scale[members, None])
         return out
 
     def _by_view(self, pairs: Index) -> list[tuple[int, Index, Index]]:
@@ -236,6 +236,13 @@ class ViewTextures(BonnTextures):
         # What float32 cannot hold becomes NaN or infinite, and is masked like other such values.
         with np.errstate(invalid="ignore", over="ignore"):
             return table.reshape(-1, channels)[at].astype(np.float32)
+
+
+def _added(part: Array, means: Array, scale: Array) -> Array:
+    """(part + means) scale; NaN where float32 cannot hold it."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = (part + means) * scale
+    return np.where(np.isfinite(found), found, np.float32(np.nan))
 
 
 @final
@@ -259,6 +266,14 @@ class ValueTextures(BonnTextures):
                 part = chunks.mask[start : start + chunks.rows]
                 placed = np.maximum(np.cumsum(part) - 1, 0)
                 self._places[start : start + chunks.rows] = placed.reshape(part.shape)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Another process unpacks its own chunks.
+        return {n: v for n, v in self.__dict__.items() if n not in ("_lock", "_unpacked")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._lock, self._unpacked = threading.Lock(), OrderedDict()
 
     def _fill(self, pairs: Index, scale: Array, out: Array) -> None:
         rows, cols = self._grid.rows, self._grid.cols

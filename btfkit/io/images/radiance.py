@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.errors import FormatError
+from btfkit.io.images.image import Array, Image
+from btfkit.io.images.profiles import Chromaticities, Declared, from_primaries
 
-Array = NDArray[np.float32]
 # A side that long, or that many values, is a damaged header.
 _MOST_SIDE, _MOST_VALUES = 1 << 16, 1 << 30
 # Beyond so many values a picture has to bring some bytes: the best codes shrink noise-free areas
@@ -19,6 +20,11 @@ _RESOLUTION = re.compile(rb"([-+])([XY]) +(\d+) +([-+])([XY]) +(\d+)")
 
 
 def read(name: str, data: bytes, *, orientation: str = "standard") -> Array:
+    """The colours of a Radiance picture, as `decode` gives them."""
+    return decode(name, data, orientation=orientation).linear
+
+
+def decode(name: str, data: bytes, *, orientation: str = "standard") -> Image:
     """A Radiance picture (RGBE) in any of the eight orientations its resolution line can say.
 
     Args:
@@ -28,7 +34,8 @@ def read(name: str, data: bytes, *, orientation: str = "standard") -> Array:
             rows from the bottom up whatever the line says, as that reader of ATRIUM does.
 
     Returns:
-        (h, w, 3) linear float32, row 0 on top.
+        The picture, (h, w, 3), row 0 on top; EXPOSURE and COLORCORR are divided out, PRIMARIES
+        converted.
 
     Raises:
         FormatError: not a Radiance picture, damaged, or absurdly large.
@@ -39,10 +46,13 @@ def read(name: str, data: bytes, *, orientation: str = "standard") -> Array:
     if data[:2] != b"#?" or match is None:
         raise FormatError(name, "not a Radiance picture: no resolution line after the header")
     if b"FORMAT=32-bit_rle_xyze" in data[:blank]:
-        raise FormatError(name, "the Radiance picture holds XYZ; expected RGB")
+        raise FormatError(
+            name, "the Radiance picture holds XYZ; expected RGB", remedy="convert it: ra_xyze -r"
+        )
     first_sign, first, count, second_sign, second, length = match.groups()
     scanlines, pixels = int(count), int(length)
-    exposure = _exposure(name, data[:blank])
+    gains = _gains(name, data[:blank])
+    declared = _declared(name, data[:blank])
     if first == second:
         raise FormatError(name, f"resolution line {match[0].decode()!r} names one axis twice")
     check_size(name, scanlines, pixels)
@@ -50,9 +60,14 @@ def read(name: str, data: bytes, *, orientation: str = "standard") -> Array:
     # Ward: the value of a mantissa m with exponent e is (m + 0.5) 2^(e - 136), black where e = 0.
     exponent = rgbe[..., 3].astype(np.int32)
     scale = np.where(exponent > 0, np.ldexp(np.float32(1), exponent - 136), np.float32(0))
-    image = (rgbe[..., :3] + np.float32(0.5)) * scale[..., None] / np.float32(exposure)
+    image = np.asarray(
+        (rgbe[..., :3] + np.float32(0.5)) * scale[..., None] / gains.astype(np.float32), np.float32
+    )
+    if declared is not None:
+        image = np.asarray(declared.converted(image), np.float32)
+    depth = np.dtype(np.float32)
     if orientation == "btf_extractor":
-        return np.ascontiguousarray(image[::-1], np.float32)
+        return Image(np.ascontiguousarray(image[::-1], np.float32), None, depth, declared)
     if orientation != "standard":
         raise ValueError(f"orientation {orientation!r}; expected standard or btf_extractor")
     # -Y runs down the rows, +X along the columns; the first axis counts scanlines.
@@ -62,20 +77,52 @@ def read(name: str, data: bytes, *, orientation: str = "standard") -> Array:
         image = image[:, ::-1]
     if first == b"X":
         image = image.transpose(1, 0, 2)
-    return np.ascontiguousarray(image, np.float32)
+    return Image(np.ascontiguousarray(image, np.float32), None, depth, declared)
 
 
-def _exposure(name: str, header: bytes) -> float:
-    """By what the values were multiplied when they were written: all EXPOSURE lines together."""
-    total = 1.0
-    for line in re.findall(rb"^EXPOSURE=(.*)$", header, re.MULTILINE):
-        try:
-            total *= float(line)
-        except ValueError:
-            total = 0.0
-    if not 1e-20 < total < 1e20:
-        raise FormatError(name, "the EXPOSURE of the Radiance picture is no positive number")
+def _gains(name: str, header: bytes) -> NDArray[np.float64]:
+    """(3,) by what values were multiplied when written: all EXPOSUREs and COLORCORRs together."""
+    total = np.ones(3)
+    for key, count in ((b"EXPOSURE", 1), (b"COLORCORR", 3)):
+        for line in _lines(header, key):
+            numbers = _numbers(line)
+            total = total * (numbers if len(numbers) == count else 0.0)
+        if not ((total > 1e-20) & (total < 1e20)).all():
+            said = "is no positive number" if count == 1 else "is not three positive numbers"
+            raise FormatError(name, f"the {key.decode()} of the Radiance picture {said}")
     return total
+
+
+def _declared(name: str, header: bytes) -> Declared | None:
+    """The primaries of the last PRIMARIES line, that of the last program that touched it."""
+    lines = _lines(header, b"PRIMARIES")
+    if not lines:
+        return None
+    values = tuple(_numbers(lines[-1]).tolist())
+    try:
+        if len(values) != 8:
+            raise ValueError("not eight")
+        chromaticities: Chromaticities = values
+        matrix = from_primaries(chromaticities)
+        return Declared("Radiance PRIMARIES", None, matrix, chromaticities=chromaticities)
+    except ValueError as error:
+        raise FormatError(
+            name, f"PRIMARIES {lines[-1][:80].decode('latin-1')!r} are none; expected x and y of "
+            "red, green, blue and white", remedy="take the line out",
+        ) from error  # fmt: skip
+
+
+def _lines(header: bytes, key: bytes) -> list[bytes]:
+    """What stands behind a key, in all lines that have it."""
+    return re.findall(rb"^" + key + rb"[ \t]*=(.*)$", header, re.MULTILINE)
+
+
+def _numbers(line: bytes) -> NDArray[np.float64]:
+    """The numbers of a line; none where one is no number."""
+    try:
+        return np.array([float(word) for word in line.split()])
+    except ValueError:
+        return np.empty(0)
 
 
 def _scanlines(name: str, data: bytes, at: int, count: int, length: int) -> NDArray[np.uint8]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +12,11 @@ from typing import Any, final
 import numpy as np
 
 from btfkit import colour
-from btfkit.btf import BTF, COLOUR
+from btfkit.btf import BTF, COLOUR, RGB
 from btfkit.errors import FormatError
-from btfkit.io import archive as archives
-from btfkit.io import images, named
+from btfkit.io import images, named, spectral, spelling
 from btfkit.io.archive import Archive
+from btfkit.io.images import Image, exr
 from btfkit.io.manifest.poses import MM, End, Pose
 from btfkit.nearfield import PointLight
 from btfkit.textures import Array
@@ -113,39 +114,35 @@ def assemble(path: Path, holder: Archive, base: str, head: Head, entries: Sequen
     Raises:
         FormatError: nothing there, a file outside the folder, or poses that do not fit.
     """
-    present, missing = _present(path, holder, base, entries)
+    present, files, missing = _present(path, holder, base, entries)
     light, light_mm = _ends(path, "light", [pose.light for pose in present])
     view, view_mm = _ends(path, "view", [pose.view or _ABOVE for pose in present])
     record = dict(head.record)
     if all(pose.view is None for pose in present):
         record["assumed"] = {**record["assumed"], "view": "from above"}
-    files = [archives.inside(pose.file, base) or "" for pose in present]
-    decode = _Decode(head.transfer, head.channels)
+    codes = named.Decoder(head.transfer, assumed="transfer" in head.record["assumed"])
+    decode = _Decode(codes, head.channels)
     plain = named.ImageTextures(holder, files, decode)
     exposure = _exposures(path, present)
     near = _near_light(path, head, light_mm, plain.shape[3])
     far = named.cosine_factor(head.cosine, light) if light_mm is None else None
 
-    def scale(index: int, h: int, w: int) -> Array:
-        factor = np.full((1, 1, 1), exposure[index], np.float32)
-        for other in (near, far):
-            factor = factor if other is None else factor * other(index, h, w)
-        return factor
-
-    def squared(index: int, h: int, w: int) -> Array:
-        return scale(index, h, w) ** 2
-
+    gains = named.Gains(exposure[:, None])
     variance = _variance(path, holder, base, present, head)
     unscaled = near is None and far is None and (exposure == 1).all()
     footprint = _numbers(path, present, "footprint")
     return named.assembled(
         path,
-        plain if unscaled else plain.scaled(scale),
+        plain if unscaled else plain.scaled(named.Product(gains, near, far)),
         light=light,
         view=view,
         light_position=light_mm,
         view_position=view_mm,
-        variance=variance if unscaled or variance is None else variance.scaled(squared),
+        variance=(
+            variance
+            if unscaled or variance is None
+            else variance.scaled(named.Product(gains, near, far, power=2))
+        ),
         footprint=None if footprint is None else footprint.astype(np.float32),
         channels=decode.channels,
         colour=head.colour,
@@ -165,54 +162,76 @@ def assemble(path: Path, holder: Archive, base: str, head: Head, entries: Sequen
 
 @final
 class _Decode:
-    """Images with the channels that the manifest or the first image names, in that order."""
+    """Images with the channels that the manifest names, or else by what the first one holds.
 
-    def __init__(self, transfer: str, channels: tuple[str, ...] | None) -> None:
-        self._transfer, self.channels = transfer, channels
+    Without names an EXR is its colour, or its wavelengths where it has such.
 
-    def __call__(self, name: str, data: bytes) -> Array:
+    Args:
+        codes: of everything but EXRs.
+        channels: to pick by name; None takes what the first image has.
+        variance: whether values are variances: of a mixture its squared weights count.
+
+    Attributes:
+        channels: those that were taken, once an image is decoded; layers' prefixes fall off.
+    """
+
+    def __init__(
+        self, codes: named.Decoder, channels: tuple[str, ...] | None, *, variance: bool = False
+    ) -> None:
+        self._codes, self._asked, self._variance = codes, channels, variance
+        self.channels: tuple[str, ...] | None = None
+
+    def __call__(self, name: str, data: bytes) -> Image:
         if not name.lower().endswith(".exr"):
-            return images.read(name, data, transfer=self._transfer)
-        pixels, names, _ = images.read_exr(name, data)
-        if self.channels is None:
-            self.channels = tuple(n for n in names if n != "A") or names
-        lacking = [n for n in self.channels if n not in names]
+            return self._codes(name, data)
+        file = images.read_exr(name, data)
+        names = file[1]
+        waves = {} if self._asked else spectral.wavelengths(name, names)
+        taken = self._asked or tuple(waves[nm] for nm in sorted(waves)) or exr.colours(name, names)
+        lacking = [n for n in taken if n not in names]
         if lacking:
             raise FormatError(
                 name, f"has channels {', '.join(names[:8])}; expected {', '.join(lacking[:8])}"
             )
-        return pixels[..., [names.index(n) for n in self.channels]]
+        image = exr.of_channels(name, file, taken, variance=self._variance)
+        if waves:
+            taken = tuple(f"{nm:g}" for nm in sorted(waves))
+        self.channels = RGB if exr.is_rgb(taken) else taken
+        return image
 
 
 def _present(
     path: Path, holder: Archive, base: str, entries: Sequence[Pose]
-) -> tuple[list[Pose], int]:
-    """The poses whose images are there, and how many are not."""
+) -> tuple[list[Pose], list[str], int]:
+    """The poses whose images are there, the members that these are, and how many are not there."""
     if not entries:
         raise FormatError(path, "names no image")
-    files = [archives.inside(pose.file, base) for pose in entries]
-    for pose, file in zip(entries, files, strict=True):
-        if file is None:
-            raise FormatError(
-                path,
-                f"{pose.file!r} would leave the folder of the manifest",
-                remedy="put the manifest above its images",
-            )
-    seen: set[str | None] = set()
-    for file in files:
-        if file in seen:
-            raise FormatError(path, f"{file!r} is named twice", remedy="remove one")
-        seen.add(file)
-    there = [pose for pose, file in zip(entries, files, strict=True) if file and file in holder]
+    found = [_member(path, holder, base, pose.file) for pose in entries]
+    there = [(pose, file) for pose, file in zip(entries, found, strict=True) if file is not None]
+    again = [file for file, count in Counter(file for _, file in there).items() if count > 1]
+    if again:
+        raise FormatError(path, f"{again[0]!r} is named twice", remedy="remove one")
     missing = len(entries) - len(there)
     if not there:
         raise FormatError(path, f"none of the {len(entries)} images it names is there")
     if missing:
-        lost = next(file for file in files if not file or file not in holder)
+        lost = next(pose.file for pose, file in zip(entries, found, strict=True) if file is None)
         warnings.warn(
             f"{path}: {missing} of {len(entries)} images are missing, first {lost!r}", stacklevel=4
         )
-    return there, missing
+    return [pose for pose, _ in there], [file for _, file in there], missing
+
+
+def _member(path: Path, holder: Archive, base: str, name: str) -> str | None:
+    """The member that an entry means; a path of another machine by its last parts."""
+    elsewhere = spelling.is_absolute(name) and images.is_image(name.replace("\\", "/"))
+    if spelling.inside(name, base) is None and not elsewhere:
+        raise FormatError(
+            path,
+            f"{name!r} would leave the folder of the manifest",
+            remedy="put the manifest above its images",
+        )
+    return holder.locate_image(name, base)
 
 
 def _ends(path: Path, name: str, ends: Sequence[End]) -> tuple[Array, Array | None]:
@@ -281,7 +300,8 @@ def _variance(
     files = [pose.variance for pose in present if pose.variance is not None]
     if not files:
         return None
-    members = [archives.inside(file, base) for file in files]
-    if len(files) < len(present) or any(m is None or m not in holder for m in members):
+    members = [_member(path, holder, base, file) for file in files]
+    if len(files) < len(present) or None in members:
         raise FormatError(path, "variance must be there for all images or for none")
-    return named.ImageTextures(holder, [m for m in members if m], _Decode("linear", head.channels))
+    decode = _Decode(named.Decoder("linear", assumed=False), head.channels, variance=True)
+    return named.ImageTextures(holder, [m for m in members if m], decode)

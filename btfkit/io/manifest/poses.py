@@ -5,18 +5,22 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, final
 
 from btfkit import directions
 from btfkit.errors import FormatError
+from btfkit.io import numerals
 
 Vector = tuple[float, float, float]
 MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 _NUMBERS = ("exposure_s", "iso", "f", "footprint")
 _MOST_NESTED = 50
+# The first line of a CSV by Excel.
+_SEPARATOR = re.compile(r"sep=(.)", re.IGNORECASE)
 
 
 @final
@@ -100,14 +104,13 @@ def _json_pose(path: str, where: str, entry: Any, mm: float) -> Pose:
 
 def csv_columns(text: str) -> list[str]:
     """Column names of a CSV manifest; empty unless it has a file and a light."""
-    first = text.lstrip().split("\n", 1)[0]
-    names = [name.strip().strip('"').lower() for name in first.split(_delimiter(first))]
+    names = _Table.of(text).names
     lit = _end_reader(names, "l") is not None
     return names if "file" in names and lit and len(set(names)) == len(names) else []
 
 
 def from_csv(path: str, text: str) -> list[Pose]:
-    """The poses of a CSV manifest.
+    """The poses of a CSV manifest, as spreadsheets write it: see `_Table`.
 
     Raises:
         FormatError: no file or light columns, or a line that has not what they say.
@@ -119,34 +122,75 @@ def from_csv(path: str, text: str) -> list[Pose]:
             path, "the first line names no columns file and tl, pl or lx, ly, lz or lx_mm, ..."
         )
     view = _end_reader(names, "v")
-    text = text.lstrip()
-    rows = csv.reader(text.splitlines(), delimiter=_delimiter(text.split("\n", 1)[0]))
     poses = []
-    try:
-        for number, cells in enumerate(rows, 1):
-            if number == 1 or not any(cell.strip() for cell in cells):
-                continue
-            if len(cells) != len(names):
-                raise FormatError(
-                    path, f"line {number} has {len(cells)} cells; expected {len(names)}"
-                )
-            row = {name: cell.strip() for name, cell in zip(names, cells, strict=True)}
-            where = f"line {number}"
-            numbers = {
-                key: _number(path, f"{where}: {key}", row[key]) for key in _NUMBERS if row.get(key)
-            }
-            poses.append(
-                Pose(
-                    row["file"],
-                    light(path, where, row),
-                    view(path, where, row) if view else None,
-                    None,
-                    numbers,
-                )
+    for where, row in _Table.of(text).rows(path):
+        numbers = {
+            key: _number(path, f"{where}: {key}", row[key]) for key in _NUMBERS if row.get(key)
+        }
+        poses.append(
+            Pose(
+                row["file"],
+                light(path, where, row),
+                view(path, where, row) if view else None,
+                None,
+                numbers,
             )
-    except csv.Error as error:
-        raise FormatError(path, f"not CSV ({error})") from error
+        )
     return poses
+
+
+@final
+@dataclass(frozen=True)
+class _Table:
+    """A table as text, from whatever program and country.
+
+    Lines end in LF, CR or both. Excel's line `sep=;` names the separator; else the first line does,
+    by what stands in it most. Empty cells behind the last name are padding.
+    """
+
+    names: list[str]
+    delimiter: str
+    lines: list[str]
+    first: int
+
+    @classmethod
+    def of(cls, text: str) -> _Table:
+        lines = text.splitlines() or [""]
+        at = next((i for i, line in enumerate(lines) if line.strip()), 0)
+        named = _SEPARATOR.fullmatch(lines[at].strip(' "\ufeff'))
+        at += named is not None
+        head = lines[at].lstrip("\ufeff") if at < len(lines) else ""
+        delimiter = named[1] if named else max(",;\t", key=head.count)
+        names = [name.strip().strip('"').strip().lower() for name in head.split(delimiter)]
+        while names and not names[-1]:
+            names.pop()
+        return cls(names, delimiter, lines[at + 1 :], at + 2)
+
+    def rows(self, path: str) -> Iterator[tuple[str, dict[str, str]]]:
+        """Where each row stands, and its cells by their names."""
+        try:
+            for number, cells in enumerate(csv.reader(self.lines, delimiter=self.delimiter)):
+                if not any(cell.strip() for cell in cells):
+                    continue
+                where, wanted = f"line {number + self.first}", len(self.names)
+                if len(cells) < wanted or any(cell.strip() for cell in cells[wanted:]):
+                    raise FormatError(path, f"{where} has {len(cells)} cells; expected {wanted}")
+                row = {name: cell.strip() for name, cell in zip(self.names, cells, strict=False)}
+                if self.delimiter == ",":
+                    _refuse_groups(path, where, row)
+                yield where, row
+        except csv.Error as error:
+            raise FormatError(path, f"not CSV ({error})") from error
+
+
+def _refuse_groups(path: str, where: str, row: Mapping[str, str]) -> None:
+    """Where commas separate, one within a quoted number may group its thousands."""
+    for name, cell in row.items():
+        if name != "file" and numerals.is_grouped(cell):
+            raise FormatError(
+                path, f"{where}: {name} is {cell!r}, a thousand or a decimal comma",
+                remedy="write it with a point",
+            )  # fmt: skip
 
 
 def _end_reader(names: list[str], end: str) -> Callable[[str, str, Mapping[str, str]], End] | None:
@@ -205,10 +249,6 @@ def _nested(value: dict[str, Any]) -> int:
     return depth
 
 
-def _delimiter(first: str) -> str:
-    return max(",;\t", key=first.count)
-
-
 def _vector(path: str, where: str, value: Any) -> Vector:
     if not isinstance(value, list) or len(value) != 3:
         raise FormatError(path, f"{where} is {str(value)[:60]}; expected three numbers")
@@ -217,12 +257,13 @@ def _vector(path: str, where: str, value: Any) -> Vector:
 
 
 def _number(path: str, where: str, value: Any) -> float:
+    plain = isinstance(value, (int, float)) and not isinstance(value, bool)
     try:
-        # Python reads 1_5 as 15.
-        plain = isinstance(value, (int, float)) or (isinstance(value, str) and "_" not in value)
         number = float(value) if plain else math.nan
-    except (ValueError, OverflowError):
+    except OverflowError:
         number = math.nan
-    if not math.isfinite(number) or isinstance(value, bool):
+    if isinstance(value, str):
+        number = found if (found := numerals.number(value.strip())) is not None else math.nan
+    if not math.isfinite(number):
         raise FormatError(path, f"{where} is {str(value)[:60]!r}; expected a number")
     return number

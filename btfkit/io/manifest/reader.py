@@ -39,7 +39,11 @@ def detect(path: Path) -> bool:
             return start.lstrip()[:1] == b"{" and b'"images"' in start
     if path.is_file() and path.suffix.lower() == ".csv":
         with path.open("rb") as file:
-            return bool(poses.csv_columns(file.read(4096).decode("utf-8-sig", "replace")))
+            start = file.read(4096)
+        try:
+            return bool(poses.csv_columns(archives.decoded(start, "replace")))
+        except ValueError:
+            return False
     names = archives.names_of(path)
     return any(archives.folder_with(names, name) is not None for name in NAMES)
 

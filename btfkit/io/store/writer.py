@@ -145,7 +145,8 @@ class _Job:
         for name, textures in _images(btf).items():
             array = group[name]
             if isinstance(array, zarr.Array):  # a group by that name cannot be: `_create`
-                images[name] = (textures, array)
+                # Textures of NaN alone are chunks as well: a missing one is damage.
+                images[name] = (textures, array.with_config({"write_empty_chunks": True}))
         return _Job(folder, journal, btf, images, _run_length(btf, dtype))
 
     def missing(self) -> list[range]:

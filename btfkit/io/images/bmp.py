@@ -1,0 +1,54 @@
+"""The header of a BMP, up to version 5 with its colour space.
+
+Source: Microsoft, BITMAPV5HEADER.
+"""
+
+from __future__ import annotations
+
+import struct
+
+from btfkit.errors import FormatError
+from btfkit.io.images import icc
+from btfkit.io.images.header import Header
+from btfkit.io.images.profiles import SRGB, Declared
+
+_V4, _V5 = 108, 124
+_SRGB, _WINDOWS, _CALIBRATED, _EMBEDDED = b"BGRs", b" niW", b"\0\0\0\0", b"DEBM"
+
+
+def size(data: bytes) -> tuple[int, int]:
+    """(h, w). Raises struct.error where it is cut."""
+    if struct.unpack_from("<I", data, 14)[0] == 12:
+        w, h = struct.unpack_from("<HH", data, 18)
+    else:
+        w, h = struct.unpack_from("<ii", data, 18)
+    # A negative height says that the rows run from the top.
+    return abs(h), w
+
+
+def describe(name: str, data: bytes) -> Header:
+    """What the header says; the fourth byte of 32-bit pixels is no colour and is left out.
+
+    Raises:
+        FormatError: a colour space that is not understood.
+    """
+    h, w = size(data)
+    return Header(h, w, colours=3, bits=8, declared=_declared(name, data))
+
+
+def _declared(name: str, data: bytes) -> Declared | None:
+    length = struct.unpack_from("<I", data, 14)[0]
+    if length < _V4:
+        return None
+    space = data[70:74]
+    if space in (_SRGB, _WINDOWS):
+        return SRGB
+    if space == _CALIBRATED and not any(data[74:122]):
+        return None
+    if space == _EMBEDDED and length >= _V5:
+        at, count = struct.unpack_from("<II", data, 126)
+        return icc.parse(name, data[14 + at : 14 + at + count], colours=3)
+    raise FormatError(
+        name, f"declares colour space {space[::-1]!r}; expected sRGB or an embedded profile",
+        remedy="save it as PNG",
+    )  # fmt: skip
