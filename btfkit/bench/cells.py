@@ -117,8 +117,9 @@ def run_cell(cell: Cell, case: Case) -> dict[str, Any]:
         if cell.model in CLOSED_FORM:
             material, ran = _closed_form(cell, case)
         else:
-            trainable = _trainable(cell, [case])
-            ran = _train(trainable, cell.budget_cpu_s or 1.0, lambda m: measures.look(m, case))
+            trainable, generators = _trainable(cell, [case])
+            budget = cell.budget_cpu_s or 1.0
+            ran = _train(trainable, generators, budget, lambda m: measures.look(m, case))
             material = trainable.material()
     return _row(cell, case, material, ran, memory)
 
@@ -127,8 +128,8 @@ def run_together(cells: Sequence[Cell], cases: Sequence[Case]) -> list[dict[str,
     """One training on all cases; a row for each. The budget is that of each, added up."""
     budget = sum(cell.budget_cpu_s or 1.0 for cell in cells)
     with measures.peak_memory() as memory:
-        trainable = _trainable(cells[0], cases)
-        ran = _train(trainable, budget, None)
+        trainable, generators = _trainable(cells[0], cases)
+        ran = _train(trainable, generators, budget, None)
     return [
         _row(cell, case, trainable.material(which), ran, memory)
         for which, (cell, case) in enumerate(zip(cells, cases, strict=True))
@@ -189,45 +190,57 @@ def _closed_form(cell: Cell, case: Case) -> tuple[Material, _Ran]:
     return material, _Ran(*spent, 1, case.samples)
 
 
-def _trainable(cell: Cell, cases: Sequence[Case]) -> Any:
+def _trainable(cell: Cell, cases: Sequence[Case]) -> tuple[Any, Any]:
+    """What is trained, and the generators that it draws from."""
     import torch
 
     from btfkit.fitting.loop import Generators
 
     torch.set_num_threads(native.threads())
     first, *others = (case.train for case in cases)
-    return _load(TRAINED[cell.model])(
+    generators = Generators(cell.seed)
+    trainable = _load(TRAINED[cell.model])(
         first,
         np.arange(len(first)),
         np.arange(0),
         settings=dict(cell.settings),
-        generators=Generators(cell.seed),
+        generators=generators,
         progress=None,
         **({"others": others} if others else {}),
     )
+    return trainable, generators
 
 
 def _train(
-    trainable: Any, budget: float, look: Callable[[Material], dict[str, float]] | None
+    trainable: Any,
+    generators: Any,
+    budget: float,
+    look: Callable[[Material], dict[str, float]] | None,
 ) -> _Ran:
     """Steps until their CPU time is spent; looks do not count."""
+    from btfkit.fitting import loop
+
     looks = iter(np.geomspace(budget / 32, budget, _LOOKS)[:-1])
     due = None if look is None else next(looks, None)
-    seconds = cpu_s = 0.0
-    steps = 0
     curve: list[dict[str, float]] = []
-    while cpu_s < budget:
-        start, cpu = time.perf_counter(), time.process_time()
-        trainable.step(cpu_s / budget)
-        cpu_s += time.process_time() - cpu
-        seconds += time.perf_counter() - start
-        steps += 1
-        if look is not None and due is not None and cpu_s >= due:
-            due = next((later for later in looks if later > cpu_s), None)
-            curve.append({"cpu_s": cpu_s, "steps": steps, **look(trainable.material())})
+
+    def seen(run: loop.Run) -> None:
+        nonlocal due
+        if look is not None and due is not None and run.cpu_s >= due:
+            due = next((later for later in looks if later > run.cpu_s), None)
+            curve.append(_point(run, look(trainable.material())))
+
+    run = loop.Run(None, None, budget_cpu_s=budget)
+    loop.train(trainable, run, generators=generators, look=seen)
+    if run.interrupted:
+        raise KeyboardInterrupt
     if look is not None:
-        curve.append({"cpu_s": cpu_s, "steps": steps, **look(trainable.material())})
-    return _Ran(seconds, cpu_s, steps, trainable.queries, tuple(curve))
+        curve.append(_point(run, look(trainable.material())))
+    return _Ran(run.elapsed_s, run.cpu_s, run.done, trainable.queries, tuple(curve))
+
+
+def _point(run: Any, errors: dict[str, float]) -> dict[str, float]:
+    return {"cpu_s": run.cpu_s, "steps": run.done, **errors}
 
 
 def _load(home: str) -> Any:

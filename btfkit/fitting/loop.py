@@ -97,7 +97,8 @@ class Run:
 
     Attributes:
         budget_s: wall time of the training alone, or None.
-        steps: steps to take, or None; exactly one of the two is set.
+        steps: steps to take, or None.
+        budget_cpu_s: CPU seconds of all threads, or None; exactly one of the three is set.
         done: steps taken. elapsed_s, cpu_s: seconds of training so far.
         curve: (elapsed seconds, step, score) at every look.
         interrupted: whether the user ended it.
@@ -112,11 +113,14 @@ class Run:
     best_score: float = math.inf
     rollbacks: int = 0
     interrupted: bool = False
+    budget_cpu_s: float | None = None
 
     def progress(self, since_s: float = 0.0) -> float:
         """Share of the budget that is spent, 0..1."""
         if self.steps is not None:
             return min(self.done / self.steps, 1.0) if self.steps else 1.0
+        if self.budget_cpu_s is not None:
+            return min(self.cpu_s / self.budget_cpu_s, 1.0)
         return min((self.elapsed_s + since_s) / (self.budget_s or 1.0), 1.0)
 
 
@@ -128,6 +132,7 @@ def train(
     state_file: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
     best: Mapping[str, Tensor] | None = None,
+    look: Callable[[Run], None] | None = None,
 ) -> None:
     """Train until the budget is spent; the trainable ends in its best state.
 
@@ -138,6 +143,7 @@ def train(
         state_file: where a resumable state is kept while the run lasts.
         progress: called with (per mille of the budget, 1000).
         best: the best state so far, of a run that goes on.
+        look: called after every step; its time is not the run's.
 
     Raises:
         FitError: the loss diverges and rolling back does not help.
@@ -149,6 +155,8 @@ def train(
             loss = trainable.step(share)
             run.done += 1
             keeper.after_step(loss)
+            if look:
+                look(run)
             # Looks and states are a part of what one waits for.
             run.elapsed_s += time.perf_counter() - start
             run.cpu_s += time.process_time() - cpu

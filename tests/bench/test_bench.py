@@ -219,7 +219,7 @@ def test_shared_networks_fit_the_material_they_are_asked_for():
     from btfkit.materials.evaluation import errors_on_btf
 
     bright, dark = (procedural(name, size=8, directions=4, seed=0) for name in ("print", "cobbles"))
-    trainable = cells._trainable(cells.Cell("print", "rainer20"), [bright, dark])
+    trainable, _ = cells._trainable(cells.Cell("print", "rainer20"), [bright, dark])
     for step in range(150):
         trainable.step(step / 150)
     for which, (own, other) in enumerate(((bright, dark), (dark, bright))):
