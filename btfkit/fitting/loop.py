@@ -46,6 +46,8 @@ class Trainable(ABC):
     model: ClassVar[str]
     queries: int = 0
     masked: int = 0
+    _steps: int = 0
+    _rate: float = 1.0
 
     @abstractmethod
     def step(self, progress: float) -> float:
@@ -87,7 +89,18 @@ class Trainable(ABC):
 
     def slow_down(self) -> None:
         """Halve the learning rates, after a divergence."""
-        raise FitError(f"{self.model} diverged and cannot slow down")
+        self._rate *= 0.5
+
+    def _counters(self, *more: int) -> Tensor:
+        """Steps, rate, queries and a model's own counters, as a state holds them."""
+        numbers = [self._steps, self._rate, self.queries, *more]
+        return torch.tensor(numbers, dtype=torch.float64)
+
+    def _count_from(self, counters: Tensor) -> list[int]:
+        """Take back what `_counters` gave; returns the model's own."""
+        steps, self._rate, queries, *more = counters.tolist()
+        self._steps, self.queries = int(steps), int(queries)
+        return [int(number) for number in more]
 
 
 @final

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, final
 
 import numpy as np
@@ -99,29 +98,3 @@ class PairDirections:
             for far, near in zip(self._far, self._near, strict=True)
         ]  # fmt: skip
         return found[0], found[1]
-
-
-@final
-class HeldOut:
-    """A fixed, small sample of the held-out pairs that scores a model during the fit."""
-
-    def __init__(self, btf: BTF, pairs: NDArray[np.intp]) -> None:
-        rng = np.random.default_rng(0)
-        _, h, w, _ = btf.shape
-        self._pairs = rng.permutation(pairs)[:24]
-        texel = rng.integers(h * w, size=1024)
-        self._rows, self._cols = torch.from_numpy(texel // w), torch.from_numpy(texel % w)
-        if len(pairs):
-            rows, cols = self._rows.numpy(), self._cols.numpy()
-            values = [btf.texture(int(pair))[rows, cols] for pair in self._pairs]
-            self._target = torch.from_numpy(np.stack(values))
-
-    def score(self, predict: Any) -> float:
-        """Mean squared error of log(1 + rgb); NaN without held-out pairs."""
-        if not len(self._pairs):
-            return math.nan
-        predicted = predict(self._pairs, self._rows, self._cols)
-        measured = torch.isfinite(self._target)
-        wanted = torch.log1p(torch.where(measured, self._target, 0.0).clamp_min(-0.1))
-        error = torch.where(measured, predicted - wanted, 0.0).square()
-        return float(error.sum() / measured.sum().clamp_min(1))

@@ -9,7 +9,6 @@ Three stages share the budget (docs/neubtf.md says what was tried):
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, final
@@ -23,15 +22,17 @@ from torch import Tensor, nn
 from btfkit.btf import BTF
 from btfkit.conventions import LOWEST_COSINE
 from btfkit.fitting import losses
+from btfkit.fitting.heldout import HeldOutSample
 from btfkit.fitting.interpolation import images_of
 from btfkit.fitting.loop import Generators, Trainable, restore_tensors, tensors_of
 from btfkit.fitting.neubtf import augment
-from btfkit.fitting.neubtf.data import HeldOut, PairDirections, first_latents, frontal_slice
+from btfkit.fitting.neubtf.data import PairDirections, first_latents, frontal_slice
 from btfkit.fitting.neubtf.guides import Guide, Guides, Window, encode
 from btfkit.fitting.neubtf.settings import Settings
 from btfkit.fitting.neubtf.siren import ParallaxHead, Renderer, on_disc
 from btfkit.fitting.neubtf.unet import Encoder
 from btfkit.fitting.pool import Pool
+from btfkit.fitting.schedule import pace
 from btfkit.materials import neubtf as evaluated
 from btfkit.materials.base import Header
 from btfkit.materials.neubtf import NeuBTFSpec
@@ -69,13 +70,12 @@ class NeuBTF(Trainable):
         )
         self.masked = self._pool.masked
         self._directions = PairDirections(btf)
-        self._held = HeldOut(btf, test)
+        self._held = HeldOutSample(btf, test, most=24, texels=1024)
         self._frontal = frontal_slice(btf, train)
         self._guides = Guides(
             self._frontal, self._pool, wrap=self._wrap, settings=s, generator=generators.torch
         )
-        self._steps = self._taught = 0
-        self._rate = 1.0
+        self._taught = 0
         self._has_encoder = s.encoder
         self._build()
 
@@ -131,14 +131,13 @@ class NeuBTF(Trainable):
             return ("the encoder: its stage had not begun, and nothing can be propagated",)
         return (f"the encoder: {taught} steps of {_LEAST_TAUGHT} at least; it carries poorly",)
 
-    def slow_down(self) -> None:
-        self._rate *= 0.5
-
     def score(self) -> float:
         with torch.no_grad():
             texture = self._texture()
             return self._held.score(
-                lambda index, rows, cols: self._predict(texture, index, rows, cols, self.spec.size)
+                lambda held: self._predict(
+                    texture, held.pairs, held.rows, held.cols, self.spec.size
+                )
             )
 
     def material(self) -> evaluated.NeuBTF:
@@ -164,15 +163,12 @@ class NeuBTF(Trainable):
 
     def state(self) -> dict[str, Tensor]:
         found = tensors_of(self._modules(), self._optimisers)
-        numbers = [self._steps, self._rate, self._stage_done, self.queries, self._taught]
-        found["numbers"] = torch.tensor(numbers, dtype=torch.float64)
+        found["numbers"] = self._counters(self._stage_done, self._taught)
         return found | {"mean": self._mean.clone(), "deviation": self._deviation.clone()}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         restore_tensors(state, self._modules(), self._optimisers)
-        steps, rate, stage, queries, taught = state["numbers"].tolist()
-        self._steps, self._rate, self._taught = int(steps), rate, int(taught)
-        self._stage_done, self.queries = int(stage), int(queries)
+        self._stage_done, self._taught = self._count_from(state["numbers"])
         self._mean, self._deviation = state["mean"].clone(), state["deviation"].clone()
 
     def _modules(self) -> dict[str, nn.Module]:
@@ -272,8 +268,7 @@ class NeuBTF(Trainable):
         )
 
     def _optimise(self, loss: Tensor, rates: Mapping[str, float], progress: float) -> float:
-        warm_up = min(1.0, (progress + 1e-4) / 0.05)
-        factor = self._rate * warm_up * (0.5 + 0.5 * math.cos(math.pi * progress)) + 1e-3
+        factor = self._rate * pace(progress, warm_up=0.05, head_start=1e-4) + 1e-3
         for name, rate in rates.items():
             for group in self._optimisers[name].param_groups:
                 group["lr"] = rate * factor

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -63,7 +62,6 @@ class Recipe(Trainable, ABC, Generic[S]):
             self._source = RowSource(source, train, test, seed=generators.seed)
         self.masked = self._source.masked
         self._held = self._source.held_out()
-        self._steps, self._rate = 0, 1.0
         self._pairs = len(train)
         self._begin(generators.numpy)
 
@@ -124,17 +122,11 @@ class Recipe(Trainable, ABC, Generic[S]):
         return float(np.square(error[good]).mean())
 
     def state(self) -> dict[str, Tensor]:
-        found = self._tensors()
-        numbers = [self._steps, self._rate, self.queries]
-        return found | {"numbers": torch.tensor(numbers, dtype=torch.float64)}
+        return self._tensors() | {"numbers": self._counters()}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         self._put(state)
-        steps, self._rate, queries = state["numbers"].tolist()
-        self._steps, self.queries = int(steps), int(queries)
-
-    def slow_down(self) -> None:
-        self._rate *= 0.5
+        self._count_from(state["numbers"])
 
 
 def _header(source: BTF | QuerySet, settings: Shared) -> Header:

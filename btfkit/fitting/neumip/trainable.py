@@ -20,6 +20,7 @@ from btfkit.fitting.neumip.engines.compiled import Compiled, Plain
 from btfkit.fitting.neumip.recipe import Recipe
 from btfkit.fitting.neumip.settings import INPUTS, Settings
 from btfkit.fitting.neumip.start import initial_texels, initial_weights
+from btfkit.fitting.schedule import pace
 from btfkit.materials.base import Material
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.arrays import aligned
@@ -81,8 +82,7 @@ class NeuMIP(Recipe[Settings]):
     def plan(self, progress: float, count: int) -> Step:
         """What the step at `progress` does with the gradient of `count` queries."""
         s = self.settings
-        factor = self._rate * min(1.0, (progress + 1e-3) / 0.02)
-        factor *= 0.005 + 0.995 * (0.5 + 0.5 * math.cos(math.pi * progress))
+        factor = self._rate * pace(progress, warm_up=0.02, head_start=1e-3, least=0.005)
         rates = (s.rate * factor, s.texture_rate * factor)
         smooth = s.smooth if self._steps % _SMOOTH_STEPS == 0 else 0.0
         return Step(

@@ -7,7 +7,6 @@ of a whitened texel: it is trained on one or several materials, and encodes othe
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,11 +21,13 @@ from btfkit import io
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting import losses
+from btfkit.fitting.heldout import HeldOutSample
 from btfkit.fitting.interpolation import images_of
 from btfkit.fitting.loop import Generators, Trainable, restore_tensors, tensors_of
 from btfkit.fitting.rainer.networks import Decoder, SetEncoder, TableEncoder
 from btfkit.fitting.rainer.samples import ProbedTexels
 from btfkit.fitting.rainer.settings import Settings
+from btfkit.fitting.schedule import pace
 from btfkit.materials import file
 from btfkit.materials import rainer as evaluated
 from btfkit.materials.base import Header
@@ -92,8 +93,7 @@ class _Rainer(Trainable):
             self._take_over(Path(s.encoder))
         parameters = [*self.encoder.parameters(), *self.decoder.parameters()]
         self._optimiser = torch.optim.Adam(parameters, lr=0.0, betas=(0.9, 0.99), fused=True)
-        self._steps, self._rate = 0, 1.0
-        self._hold(btf, test)
+        self._held = HeldOutSample(btf, test, most=_HELD_PAIRS, texels=_HELD_TEXELS)
 
     def _others(self, btf: BTF, given: Sequence[BTF]) -> list[BTF]:
         named = [io.open(name) for name in self.settings.materials.split(",") if name]
@@ -120,15 +120,6 @@ class _Rainer(Trainable):
         for name, tensor in self.decoder.arrays().items():
             tensor.copy_(torch.from_numpy(np.array(fitted.weights[name])))
 
-    def _hold(self, btf: BTF, test: NDArray[np.intp]) -> None:
-        """A fixed, small sample of the held-out pairs that scores the model."""
-        rng = np.random.default_rng(0)
-        _, h, w, _ = btf.shape
-        self._held_pairs = rng.permutation(test)[:_HELD_PAIRS]
-        self._held_texels = torch.from_numpy(rng.integers(h * w, size=_HELD_TEXELS))
-        rows, cols = np.divmod(self._held_texels.numpy(), w)
-        self._held = [torch.from_numpy(btf.texture(int(p))[rows, cols]) for p in self._held_pairs]
-
     # --- the loop's side -------------------------------------------------------------------
 
     def step(self, progress: float) -> float:
@@ -147,8 +138,7 @@ class _Rainer(Trainable):
         predicted = self._predict(data, self._encoded(data, texels, probes), pairs, texels)
         loss = losses.log_l1(predicted, data.targets(slots, texels))
         self.queries += len(slots) * len(texels)
-        warm_up = min(1.0, (progress + 1e-4) / 0.05)
-        factor = self._rate * warm_up * (0.5 + 0.5 * math.cos(math.pi * progress)) + 1e-3
+        factor = self._rate * pace(progress, warm_up=0.05, head_start=1e-4) + 1e-3
         for group in self._optimiser.param_groups:
             group["lr"] = s.rate * factor
         self._optimiser.zero_grad(set_to_none=True)
@@ -157,21 +147,14 @@ class _Rainer(Trainable):
         self._optimiser.step()
         return float(loss.detach())
 
-    def slow_down(self) -> None:
-        self._rate *= 0.5
-
     def score(self) -> float:
-        if not self._held:
-            return math.nan
         data = self._data[0]
         with torch.no_grad():
-            codes = self._encoded(data, self._held_texels, None)
-            predicted = self._predict(data, codes, self._held_pairs, self._held_texels)
-        target = torch.stack(self._held)
-        measured = torch.isfinite(target)
-        wanted = torch.log1p(torch.where(measured, target, 0.0).clamp_min(-0.1))
-        error = torch.where(measured, predicted - wanted, 0.0).square()
-        return float(error.sum() / measured.sum().clamp_min(1))
+            return self._held.score(
+                lambda held: self._predict(
+                    data, self._encoded(data, held.texels, None), held.pairs, held.texels
+                )
+            )
 
     def material(self, which: int = 0) -> evaluated.Rainer19 | evaluated.Rainer20:
         """The BTF itself, or another one that the networks learn from: its codes."""
@@ -205,13 +188,11 @@ class _Rainer(Trainable):
 
     def state(self) -> dict[str, Tensor]:
         found = tensors_of(self._modules(), {"moments": self._optimiser})
-        numbers = [self._steps, self._rate, self.queries]
-        return found | {"numbers": torch.tensor(numbers, dtype=torch.float64)}
+        return found | {"numbers": self._counters()}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         restore_tensors(state, self._modules(), {"moments": self._optimiser})
-        steps, rate, queries = state["numbers"].tolist()
-        self._steps, self._rate, self.queries = int(steps), rate, int(queries)
+        self._count_from(state["numbers"])
 
     def _modules(self) -> dict[str, nn.Module]:
         return {"encoder": self.encoder, "decoder": self.decoder}
