@@ -175,7 +175,8 @@ def solved(
     if start is not None:
         off = np.abs(design @ start - target) * np.sqrt(weight)
         keep &= off <= 5 * max(1.0, float(np.median(off[keep])) / 0.6745)
-    scale = np.maximum(np.sqrt(np.mean(design**2, axis=0)), 1e-300)
+    size = np.sqrt(np.mean(design**2, axis=0))
+    scale = np.where(size > 0, size, 1.0)
     answer, covariance, condition = np.zeros(design.shape[1]), np.eye(design.shape[1]), np.inf
     for _ in range(rounds):
         if keep.sum() < design.shape[1]:

@@ -82,9 +82,9 @@ def fit_linearity(
     # Exposure times are given to four digits at best.
     weight = 1 / (relative + 1e-8)
     ones = np.ones(len(y))
-    plain, *_, kept = solved(ratio, ones, weight)
-    deviation = 1 / np.maximum(ratio @ plain, 1e-300) - 1
-    before, level, deviation = _binned(y, deviation, weight)
+    plain, *_ = solved(ratio, ones, weight)
+    off = 1 / np.maximum(ratio @ plain, 1e-300) - 1
+    before, level, deviation = _binned(y, off, weight)
     full = np.concatenate([ratio, -y[:, None], -(y**2)[:, None]], axis=1)
     answer, covariance, condition, kept = solved(full, ones, weight)
     after, *_ = _binned(y[kept], (full @ answer - ones)[kept], weight[kept])
