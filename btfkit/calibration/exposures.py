@@ -48,7 +48,11 @@ class Exposures:
 
 
 def refine_exposures(
-    series: Sequence[Sequence[Any]], exposure_s: ArrayLike, noise: NoiseModel
+    series: Sequence[Sequence[Any]],
+    exposure_s: ArrayLike,
+    noise: NoiseModel,
+    *,
+    lamp: Sequence[ArrayLike] | None = None,
 ) -> Exposures:
     """Exposure factors from what neighbouring exposures both measure well.
 
@@ -56,6 +60,7 @@ def refine_exposures(
         series: of any number of scenes, each k frames (h, w) in the order of `exposure_s`.
         exposure_s: (k,) nominal seconds.
         noise: of the sensor.
+        lamp: of each series the brightness (k,) of the lamp, relative; None where it is steady.
 
     Raises:
         CalibrationError: two neighbouring exposures share too few pixels, naming them.
@@ -66,10 +71,10 @@ def refine_exposures(
     overlap = np.zeros(len(nominal), np.intp)
     for longer, shorter in zip(order[:-1], order[1:], strict=True):
         ratios, count = [], 0
-        for frames in series:
-            checked(frames, nominal, 1.0)
+        for i, frames in enumerate(series):
+            _, _, light = checked(frames, nominal, 1.0 if lamp is None else lamp[i])
             found, pixels = _ratios(frames, nominal, int(longer), int(shorter), noise)
-            ratios += found
+            ratios += [ratio * light[longer] / light[shorter] for ratio in found]
             count += pixels
         if count < _FEWEST:
             raise CalibrationError(

@@ -134,7 +134,7 @@ class Sensitivity:
         pixel: (h, w) sensitivity against the neighbours of the same colour, mean 1; 0 where a
             pixel is dead. sd: deviation of it. noise: deviation that the frames' own noise has
             in it, before it was taken out.
-        shading: (h, w) smooth brightness of the flat, 1 at its brightest.
+        shading: (h, w) smooth brightness of the flat, 1 at its brightest, each colour alone.
         dead: how many pixels see less than half of their neighbours, or are hot.
     """
 
@@ -157,7 +157,7 @@ def fit_sensitivity(
     exposure_s: ArrayLike,
     noise: NoiseModel,
     *,
-    period: int,
+    period: tuple[int, int],
     hot: Any = None,
     smooth: float = 12.0,
 ) -> Sensitivity:
@@ -167,7 +167,8 @@ def fit_sensitivity(
         frames: k frames (h, w), counts; saturated pixels are left out.
         exposure_s: (k,) seconds.
         noise: of the sensor.
-        period: 2 for a Bayer mosaic, 1 for a sensor of one colour.
+        period: rows and columns after which colours repeat: (2, 2) for a Bayer mosaic, (1, 1)
+            for one colour, (1, 3) for three side by side.
         hot: (h, w) pixels known to be of no use, or None.
         smooth: deviation of the Gaussian that divides lens from pixel, pixels of one colour.
 
@@ -189,9 +190,9 @@ def fit_sensitivity(
         mean = total / weight
         relative = noise.variance(total) / np.maximum(total, 1) ** 2
     shading, pixel = np.ones_like(mean), np.ones_like(mean)
-    for row in range(period):
-        for col in range(period):
-            at = (slice(row, None, period), slice(col, None, period))
+    for row in range(period[0]):
+        for col in range(period[1]):
+            at = (slice(row, None, period[0]), slice(col, None, period[1]))
             shading[at] = _smoothed(mean[at], smooth)
     with np.errstate(divide="ignore", invalid="ignore"):
         pixel = mean / shading
@@ -203,8 +204,12 @@ def fit_sensitivity(
     told = max(float(np.mean((good - 1) ** 2)) - own, 0.0)
     pixel = 1 + (pixel - 1) * told / max(told + own, 1e-300)
     pixel[unusable] = 0
-    bright = shading / np.nanmax(shading[np.isfinite(shading)])
-    return Sensitivity(pixel, float(np.sqrt(told)), float(np.sqrt(own)), bright, int(unusable.sum()))
+    for row in range(period[0]):
+        for col in range(period[1]):
+            at = (slice(row, None, period[0]), slice(col, None, period[1]))
+            # Every colour by itself: the colour of the flat is not that of the lens.
+            shading[at] /= np.quantile(shading[at], 0.999)
+    return Sensitivity(pixel, float(np.sqrt(told)), float(np.sqrt(own)), shading, int(unusable.sum()))
 
 
 def _smoothed(plane: Floats, sigma: float) -> Floats:

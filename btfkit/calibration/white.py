@@ -6,13 +6,14 @@ ones are dimmer at grazing angles and brighter towards the mirror direction.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from btfkit import directions
 from btfkit.calibration.noise import solved
 from btfkit.errors import CalibrationError
 
@@ -27,10 +28,12 @@ class Diffuser:
     Attributes:
         weights: of the terms of `_terms`; (rho,) is a Lambertian surface of reflectance rho.
         residual: relative rms of the table that they were fitted to, 0 where there was none.
+        tint: reflectance of each channel over their mean; empty where all are alike.
     """
 
     weights: tuple[float, ...]
     residual: float = 0.0
+    tint: tuple[float, ...] = ()
 
     def factor(self, light: ArrayLike, view: ArrayLike) -> Floats:
         """pi times the BRDF.
@@ -94,21 +97,30 @@ def fit_diffuser(
 def from_document(section: Any) -> Diffuser:
     """The white reference of sequence.json: target.white.
 
-    Either {"reflectance": 0.99}, or with {"incidence_deg": 8, "table": [[theta_light,
-    theta_view, phi, factor], ...]} in degrees, phi between the azimuths of light and view.
+    {"reflectance": 0.99}, or a list of one for each channel; with it either
+    "angular": [a, b, c], the factor over the reflectance being
+    a + b (cos_light + cos_view) + c cos_light cos_view, or
+    "incidence_deg": 8 and "table": [[theta_light, theta_view, phi, factor], ...] in degrees, phi
+    between the azimuths of light and view, scaled so that the reflectance holds there.
 
     Raises:
         CalibrationError: no reflectance, or a table that is none.
     """
     where = "target.white of sequence.json"
-    if not isinstance(section, dict) or "reflectance" not in section:
+    if not isinstance(section, Mapping) or "reflectance" not in section:
         raise CalibrationError(
             f"{where} says no reflectance", remedy='add it, like "white": {"reflectance": 0.99}'
         )
     try:
-        reflectance = float(section["reflectance"])
+        channels = np.atleast_1d(np.asarray(section["reflectance"], float))
+        mean = _checked_reflectance(float(channels.mean()))
+        tint = tuple((channels / mean).tolist()) if len(channels) > 1 else ()
+        if "angular" in section:
+            a, b, c = (float(x) for x in section["angular"])
+            weights = (mean * (a + 2 * b + c), -mean * (b + c), mean * c)
+            return Diffuser(weights, 0.0, tint)
         if "table" not in section:
-            return lambertian(reflectance)
+            return replace(lambertian(mean), tint=tint)
         table = np.asarray(section["table"], float)
         theta = np.radians(float(section.get("incidence_deg", 8.0)))
         if table.ndim != 2 or table.shape[1] != 4 or not np.isfinite(table).all():
@@ -119,12 +131,10 @@ def from_document(section: Any) -> Diffuser:
             remedy="give reflectance, and a table of [theta_light, theta_view, phi, factor]",
         ) from error
     t_light, t_view, phi = np.radians(table[:, :3]).T
-    zero = np.zeros_like(phi)
-    light = np.stack([np.sin(t_light), zero, np.cos(t_light)], axis=-1)
-    view = np.stack(
-        [np.sin(t_view) * np.cos(phi), np.sin(t_view) * np.sin(phi), np.cos(t_view)], axis=-1
-    )
-    return fit_diffuser(light, view, table[:, 3], reflectance=reflectance, theta=float(theta))
+    light = directions.from_angles(t_light, np.zeros_like(phi))
+    view = directions.from_angles(t_view, phi)
+    found = fit_diffuser(light, view, table[:, 3], reflectance=mean, theta=float(theta))
+    return replace(found, tint=tint)
 
 
 @final
@@ -203,6 +213,8 @@ def fit_scale(
                 remedy="leave the frame out, or correct its pose",
             )
     expected = diffuser.factor(light, view) * light[:, 2] * np.asarray(irradiance, float)
+    if len(diffuser.tint) == values.shape[1]:
+        values, noise = values / diffuser.tint, noise / diffuser.tint
     scales = values / expected[:, None]
     relative = np.maximum(noise / values, 1e-6)
     weight = 1 / relative**2

@@ -163,13 +163,13 @@ def test_linearity_needs_a_ramp():
         fit_linearity(bright, [1, 2, 8], NOISE)
 
 
-@pytest.mark.parametrize("period", [1, 2])
+@pytest.mark.parametrize("period", [(1, 1), (2, 2)])
 def test_sensitivity_of_pixels_is_told_from_the_shading_of_the_lens(period):
     rng = np.random.default_rng(2)
     pixel = 1 + rng.normal(0, 0.01, SIZE)
     pixel[7, 11] = 0.01
     colour = np.ones(SIZE)
-    if period == 2:
+    if period == (2, 2):
         colour[::2, ::2], colour[1::2, 1::2] = 0.6, 0.4
     frames = [FakeSensor().shoot(5e4 * SHADING * colour * pixel, 1, rng) for _ in range(6)]
     found = fit_sensitivity(frames, [1] * 6, NOISE, period=period)
@@ -183,7 +183,7 @@ def test_sensitivity_of_pixels_is_told_from_the_shading_of_the_lens(period):
 
 def test_flats_that_saturate_everywhere_are_refused():
     with pytest.raises(CalibrationError, match="all 1 flat frames saturate everywhere"):
-        fit_sensitivity([np.full(SIZE, 4095)], [1], NOISE, period=1)
+        fit_sensitivity([np.full(SIZE, 4095)], [1], NOISE, period=(1, 1))
 
 
 def test_sizes_that_differ_are_refused_by_frame():
