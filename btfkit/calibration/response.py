@@ -16,6 +16,8 @@ Floats = NDArray[np.floating]
 _REGIONS = 8
 # A sensor that is this linear is left as it is: a correction would bring its own noise.
 LINEAR_ENOUGH = 1e-3
+# What is further off the fitted curve is no response: a wrong time would be taken for one.
+SMOOTH_ENOUGH = 3e-3
 
 
 @final
@@ -92,6 +94,12 @@ def fit_linearity(
     held, curve = {}, (float(answer[-2]), float(answer[-1]))
     if before < LINEAR_ENOUGH:
         held["curve"] = f"0: linear within {100 * before:.3f} %"
+        curve, after = (0.0, 0.0), before
+    elif after > SMOOTH_ENOUGH:
+        held["curve"] = (
+            f"0: the ramp is {100 * after:.2f} % off any smooth curve; its exposure times, or the "
+            "lamp, are not what they are said to be"
+        )
         curve, after = (0.0, 0.0), before
     values = {"c1": curve[0], "c2": curve[1]}
     errors = {"c1": float(sd[-2]), "c2": float(sd[-1])}
