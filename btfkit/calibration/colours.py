@@ -76,7 +76,8 @@ def fit_colour(
     """The correction through patches of known colour.
 
     Args:
-        camera: (p, 3) means of the patches, as reflectance factors of the camera's channels.
+        camera: (p, 3) means of the patches over what the white reference would read, so that white
+            is 1 in every channel.
         reference: (p, 3) linear BT.709 of the patches, white 1.
         degree: 1 or 2; None takes the one that predicts patches left out better.
 
@@ -120,34 +121,46 @@ def _fitted(x: Floats, y: Floats, degree: int) -> ColourCorrection:
 
 
 def _solved(x: Floats, y: Floats, degree: int) -> tuple[Floats, float]:
-    """(3, terms) of least squares, then of least perceived difference, and the condition."""
+    """(3, terms) of least squares, then of least perceived difference, and the condition.
+
+    Rows sum to 1: the white reference is white, and so is every grey, at any exposure.
+    """
     terms = root_polynomial(x, degree)
+    free, rest = terms[:, 1:] - terms[:, :1], y - terms[:, :1]
     # The eye sees relative differences: dark patches would count for nothing.
     weight = 1 / (colour.rgb_to_xyz(y)[:, 1] + 0.02)
-    scaled = terms * weight[:, None]
-    matrix, _, _, singular = np.linalg.lstsq(scaled, y * weight[:, None], rcond=None)
-    condition = float(singular[0] / max(singular[-1], 1e-300))
-    return _perceived(terms, y, matrix.T), condition
+    answer, _, _, singular = np.linalg.lstsq(
+        free * weight[:, None], rest * weight[:, None], rcond=None
+    )
+    # Greys alone leave all of the differences near 0: the terms themselves are the measure.
+    condition = float(np.linalg.norm(terms * weight[:, None]) / max(singular[-1], 1e-300))
+    return _whole(_perceived(terms, y, answer.T)), condition
 
 
-def _perceived(terms: Floats, y: Floats, matrix: Floats) -> Floats:
-    """The matrix moved towards equal steps of lightness and colour (CIELAB)."""
+def _whole(free: Floats) -> Floats:
+    """(3, t) of what is free of it, (3, t - 1)."""
+    return np.concatenate([1 - free.sum(axis=1, keepdims=True), free], axis=1)
+
+
+def _perceived(terms: Floats, y: Floats, free: Floats) -> Floats:
+    """What is free of the matrix, moved towards equal steps of lightness and colour (CIELAB)."""
     goal = lab(y)
     step = 1e-6
     for _ in range(8):
-        now = terms @ matrix.T
+        now = terms @ _whole(free).T
         value = lab(now)
         slopes = np.stack([(lab(now + step * e) - value) / step for e in np.eye(3)], axis=-1)
         # CIEDE2000 forgives differences of strong colours: about as much as this.
         forgiven = np.ones_like(value)
         forgiven[:, 1:] += 0.045 * np.hypot(goal[:, 1], goal[:, 2])[:, None]
-        jacobian = np.einsum("pij,pt->pijt", slopes / forgiven[..., None], terms)
+        moved = terms[:, 1:] - terms[:, :1]
+        jacobian = np.einsum("pij,pt->pijt", slopes / forgiven[..., None], moved)
         flat = jacobian.reshape(value.size, -1)
         change, *_ = np.linalg.lstsq(flat, ((goal - value) / forgiven).ravel(), rcond=1e-12)
-        matrix = matrix + change.reshape(matrix.shape)
-        if np.abs(change).max() < 1e-10 * np.abs(matrix).max():
+        free = free + change.reshape(free.shape)
+        if np.abs(change).max() < 1e-10 * np.abs(free).max():
             break
-    return matrix
+    return free
 
 
 def lab(rgb: Floats) -> Floats:

@@ -224,10 +224,12 @@ def measure_colour(scene: Scene, scale: Scale, nominal_mm: float | None) -> tupl
     corrected = found.apply(camera)
     names = [str(patch.get("name", i)) for i, patch in enumerate(patches)]
     grey = np.ptp(reference, axis=1) <= _NEUTRAL * reference.mean(axis=1)
+    relative = corrected[grey] / reference[grey] - 1
     off = corrected[grey].mean(axis=1) / reference[grey].mean(axis=1) - 1
     data = {
         **found.record(), "patches": names, "measured": corrected.tolist(),
         "reference": reference.tolist(),
+        "greys_by_channel": relative.tolist(),
         "greys": {n: float(o) for n, o in zip(np.array(names)[grey].tolist(), off, strict=True)},
     }  # fmt: skip
     return found, data
