@@ -38,7 +38,11 @@ class Level:
 
 
 def mask_of(
-    entry: Mapping[str, Any], frame: Frame, placement: Placement, shape: tuple[int, int]
+    entry: Mapping[str, Any],
+    frame: Frame,
+    placement: Placement,
+    shape: tuple[int, int],
+    shift: Floats | None = None,
 ) -> NDArray[np.bool_]:
     """(h, w) pixels within the inner part of a patch.
 
@@ -47,6 +51,7 @@ def mask_of(
         frame: that shows it.
         placement: of the rig.
         shape: of the frame.
+        shift: (2,) columns and rows by which the placement is off, or None.
 
     Raises:
         CalibrationError: neither, or out of the frame.
@@ -64,7 +69,7 @@ def mask_of(
         )
     else:
         corners = corners_mm(entry, share=_INNER)
-        pixels = placement.project(corners, frame)
+        pixels = placement.project(corners, frame) + (0 if shift is None else shift)
         if np.any(pixels < -0.5) or np.any(pixels > np.array(shape[::-1]) - 0.5):
             middle = pixels.mean(axis=0)
             raise CalibrationError(

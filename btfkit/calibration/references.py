@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from btfkit.calibration import lamp as lamps
 from btfkit.calibration import white as whites
+from btfkit.calibration.aim import shift_of
 from btfkit.calibration.colours import ColourCorrection, fit_colour
 from btfkit.calibration.lamp import Lamp
 from btfkit.calibration.merge import Merged
@@ -26,6 +27,8 @@ from btfkit.sequence import Sequence as Frames
 Floats = NDArray[np.floating]
 LIT = ("sample", "white", "colour", "reference", "target", "sphere")
 _ORIGIN = np.zeros(3)
+# How far a rig may be from what its builder believes, seen on the sample.
+_OFF_MM = 4.0
 # Channels of a grey that differ by no more than this.
 _NEUTRAL = 0.03
 # A group of frames may be merged once for several patches; more than these say no more.
@@ -68,11 +71,26 @@ class Scene:
         chosen = np.unique(np.linspace(0, len(found) - 1, min(_MOST_GROUPS, len(found))).astype(int))
         return [found[i] for i in chosen]
 
-    def level(self, merged: Merged, entry: Mapping[str, Any], frame: Frame) -> Level:
-        """What a patch reads in a merged frame."""
+    def mask(
+        self, merged: Merged, entry: Mapping[str, Any], frame: Frame, shift: Floats
+    ) -> NDArray[np.bool_]:
+        """(h, w) a patch in a merged frame."""
         h, w = merged.radiance.shape[:2]
-        mask = mask_of(entry, frame, self.placement, (h, w))
-        return level_of(merged, mask, self.colours(merged))
+        return mask_of(entry, frame, self.placement, (h, w), shift)
+
+    def level(
+        self, merged: Merged, entry: Mapping[str, Any], frame: Frame, shift: Floats
+    ) -> Level:
+        """What a patch reads in a merged frame."""
+        return level_of(merged, self.mask(merged, entry, frame, shift), self.colours(merged))
+
+    def shift(self, merged: Merged, frame: Frame) -> Floats:
+        """(2,) pixels by which a nominal pose is off in a frame; 0 of a calibrated one."""
+        if self.placement.source != "nominal":
+            return np.zeros(2)
+        white = self.sequence.target.get("white")
+        entries = [*_patches(self), *([white] if isinstance(white, Mapping) else [])]
+        return shift_of(merged, entries, frame, self.placement, reach_mm=_OFF_MM)
 
     def lit(self, entry: Mapping[str, Any], frame: Frame, nominal_mm: float | None) -> float:
         """Cosine of the light at a patch, times the square of the nominal distance over its own."""
@@ -135,8 +153,9 @@ def measure_stray(scene: Scene) -> tuple[Stray, dict[str, Any]]:
         shape = merged.radiance.shape[:2]
         shading = np.ones(shape) if scene.radiometry.shading is None else scene.radiometry.shading
         mean = frame_means(merged, shading, colours)
+        shift = scene.shift(merged, frame)
         for patch in greys:
-            mask = mask_of(patch, frame, scene.placement, (shape[0], shape[1]))
+            mask = scene.mask(merged, patch, frame, shift)
             values.append(level_of(merged, mask, colours).mean)
             expected.append(float(np.mean(patch["reflectance"])) * scene.lit(patch, frame, _near(scene, frame)))
             around.append(mean / shading[mask].mean())
@@ -163,9 +182,11 @@ def measure_white(scene: Scene) -> tuple[Scale, dict[str, Any]]:
     at = np.asarray(entry.get("centre_mm", _ORIGIN), float)
     frames = [scene.sequence.frames[group[0]] for group in groups]
     nominal = _near(scene, frames[0])
-    levels, directions, near = [], [], []
+    levels, directions, near, shifts = [], [], [], []
     for group, frame in zip(groups, frames, strict=True):
-        levels.append(scene.level(scene.merged(group), entry, frame))
+        merged = scene.merged(group)
+        shifts.append(scene.shift(merged, frame))
+        levels.append(scene.level(merged, entry, frame, shifts[-1]))
         directions.append(scene.placement.directions(frame, at))
         distance = scene.placement.distance_mm(frame, at)
         near.append(1.0 if distance is None or nominal is None else (nominal / distance) ** 2)
@@ -177,7 +198,7 @@ def measure_white(scene: Scene) -> tuple[Scale, dict[str, Any]]:
     data = {
         **found.record(), "files": [f.file for f in frames], "distance_mm": nominal,
         "diffuser_residual": diffuser.residual, "placement": scene.placement.source,
-        "spread": [x.spread for x in levels],
+        "spread": [x.spread for x in levels], "shift_px": np.array(shifts).tolist(),
     }  # fmt: skip
     return found, data
 
@@ -205,9 +226,10 @@ def measure_colour(scene: Scene, scale: Scale, nominal_mm: float | None) -> tupl
     for group in groups:
         frame = scene.sequence.frames[group[0]]
         merged = scene.merged(group)
+        shift = scene.shift(merged, frame)
         sums.append(
             [
-                scale.reflectance(scene.level(merged, patch, frame).mean[None])[0]
+                scale.reflectance(scene.level(merged, patch, frame, shift).mean[None])[0]
                 / scene.lit(patch, frame, nominal_mm)
                 for patch in patches
             ]

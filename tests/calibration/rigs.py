@@ -24,7 +24,7 @@ def patches():
     hues = 0.05 + 0.7 * rng.random((18, 3)) ** 1.5
     colours = [*hues.tolist(), *[[g] * 3 for g in GREYS]]
     return [
-        {"name": f"p{i}", "centre_mm": [-25 + 10 * (i % 6), 22 - 8 * (i // 6), 0],
+        {"name": f"p{i}", "centre_mm": [-25 + 10 * (i % 6), 20 - 8 * (i // 6), 0],
          "size_mm": [8, 6], "reflectance": colour}
         for i, colour in enumerate(colours)
     ]  # fmt: skip
@@ -100,14 +100,14 @@ class FakeRig:
         out[white] = angular[white][:, None]
         return out * lit[..., None]
 
-    def write(self, folder: Path, *, poses=(0.2, 0.5), exposures=(0.02, 0.08), scale=6000.0):
+    def write(self, folder: Path, *, poses=(0.2, 0.5), exposures=(0.02, 0.08), scale=14000.0):
         """A sequence: darks, flats, white, colours, references and a sample."""
         rng = np.random.default_rng(5)
         (folder / "frames").mkdir(parents=True)
         frames: list[Frame] = []
         pixel, shading = self.maps()
         shots = [("dark", 0.0, t, None) for t in (0.02, 0.02, 0.08, 0.08, 1.0, 1.0)]
-        shots += [("flat", 0.0, t, None) for t in (0.02, 0.02, 0.08, 0.08, 0.25, 0.25, 0.4, 0.4)]
+        shots += [("flat", 0.0, t, None) for t in (0.02, 0.02, 0.08, 0.08, 0.15, 0.15, 0.3, 0.3)]
         group = 0
         for kind in ("reference", "white", "colour", "sample", "reference", "white", "reference"):
             for pose in (poses[:1] if kind == "reference" else poses):

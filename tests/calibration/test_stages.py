@@ -53,7 +53,10 @@ def edited(folder, *, sensor=None, target=None, frames=None, rig=None):
     document = json.loads((folder / "sequence.json").read_text())
     document["sensor"] |= sensor or {}
     document["target"] |= target or {}
-    document = {k: v for k, v in document.items() if k != "rig" or rig is not False}
+    if rig is False:
+        document.pop("rig", None)
+    elif rig:
+        document["rig"] |= rig
     document["sensor"] = {k: v for k, v in document["sensor"].items() if v is not None}
     document["target"] = {k: v for k, v in document["target"].items() if v is not None}
     kept = [f for f in map(frames or (lambda f: f), sequence.frames) if f is not None]
@@ -117,7 +120,7 @@ def test_the_sample_comes_out_as_absolute_reflectance(calibrated, written):
         factor = correction.apply(scale.reflectance(rgb.astype(float), np.array(near)))
         truth = RIG.plate(frame.axes["arm"])
         # The base of the plate, between patches and white.
-        clear = np.s_[155:190, 40:280]
+        clear = np.s_[160:192, 40:280]
         np.testing.assert_allclose(
             factor[clear].mean((0, 1)), truth[clear].mean((0, 1)), rtol=5e-3
         )
@@ -260,6 +263,21 @@ def test_patches_out_of_the_frame_are_named(folder):
     away = {**FakeRig().document()["target"]["white"], "centre_mm": [80, 0, 0]}
     with pytest.raises(CalibrationError, match="the white reference is expected at column .* out of"):
         stages.calibrate(edited(folder, target={"white": away}))
+
+
+def test_a_camera_that_stands_where_it_should_not_is_aimed_by_the_patches(folder, calibrated):
+    # 6 and 4 pixels of patches that are 40 x 30 pixels wide and 10 apart.
+    camera = RIG.document()["rig"]["camera"]
+    moved = {**camera, "position_mm": [1.2, -0.8, RIG.camera_mm]}
+    found, _ = stages.calibrate(edited(folder, rig={"camera": moved}))
+    shifts = np.array(found.section("white").data["shift_px"])
+    # Any shift that leaves 85 % of a patch within it will do.
+    np.testing.assert_allclose(shifts, np.tile([6, 4], (len(shifts), 1)), atol=3.1)
+    assert max(abs(off) for off in found.section("colour").data["greys"].values()) < 5e-3
+    right = calibrated[0].section("white").data
+    np.testing.assert_allclose(
+        found.section("white").data["counts_per_s"], right["counts_per_s"], rtol=5e-3
+    )
 
 
 def test_a_rig_that_is_not_described_needs_windows_and_directions(folder):
