@@ -153,8 +153,18 @@ def _colour(data: Mapping[str, Any]) -> str:
     return _table(rows) + parts
 
 
+def _geometry(data: Mapping[str, Any]) -> str:
+    rows = [(f"Residual of each {kind}", f"{rms:.3f} px rms") for kind, rms in data["residuals_px"].items()]
+    rows += [("Observations left out", str(data["rejected"])), ("Condition", f"{data['condition']:.3g}")]
+    if data["held"]:
+        rows.append(("Held, since the frames do not tell them", ", ".join(data["held"])))
+    views = data["view_rms_px"]
+    drawn = plots.svg(plots.bars([str(i) for i in range(len(views))], views, "residual of a view, px rms"))
+    return _table(rows) + drawn
+
+
 _SECTIONS = {
-    "radiometry": _radiometry, "lamp": _lamp, "stray": _stray, "white": _white, "colour": _colour,
+    "radiometry": _radiometry, "lamp": _lamp, "geometry": _geometry, "stray": _stray, "white": _white, "colour": _colour,
 }  # fmt: skip
 
 

@@ -21,6 +21,7 @@ from btfkit.calibration.calibration import Calibration
 from btfkit.calibration.demosaic import demosaic
 from btfkit.calibration.radiometry import Radiometry
 from btfkit.calibration.references import Scene as Lit
+from btfkit.calibration.report import write_report
 from btfkit.calibration.sensor_stage import frames_used
 from btfkit.calibration.stray import fit_stray
 from btfkit.cli import btfkit as verbs
@@ -329,6 +330,17 @@ def test_stray_light_beyond_reason_is_refused_and_none_is_none():
     assert found.share == 0 or found.share == pytest.approx(0, abs=0.01)
     alike = fit_stray(np.full((4, 1), 0.5), np.full(4, 0.5), np.ones((4, 1)))
     assert "from dark to bright" in alike.fitted.held["share"]
+
+
+def test_the_report_shows_residuals_of_a_geometry_and_what_is_missing(calibrated, tmp_path):
+    geometry = {"residuals_px": {"corner": 0.031}, "rejected": 4, "condition": 210.0,
+                "held": ["light <b>"], "view_rms_px": [0.03, 0.04]}  # fmt: skip
+    found = calibrated[0].with_section("geometry", documented.Section("0", geometry))
+    write_report(found.without("colour", "no frames of kind colour"), tmp_path / "r.html", title="a & b")
+    page = (tmp_path / "r.html").read_text()
+    for text in ("0.031 px rms", "light &lt;b&gt;", "a &amp; b", "missing: no frames of kind colour"):
+        assert text in page
+    assert "ΔE2000" not in page
 
 
 def call(*arguments):
