@@ -1,4 +1,4 @@
-"""The stages after the sensor: lamp, stray light, white and colours, from their frames."""
+"""The stages of the references: stray light, white and colours, from their frames."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.calibration import lamp as lamps
 from btfkit.calibration import white as whites
 from btfkit.calibration.aim import shift_of
 from btfkit.calibration.colours import ColourCorrection, fit_colour
-from btfkit.calibration.lamp import Lamp
 from btfkit.calibration.merge import Merged
 from btfkit.calibration.patches import Level, level_of, mask_of
 from btfkit.calibration.placement import Placement
@@ -25,7 +23,6 @@ from btfkit.sequence import Frame
 from btfkit.sequence import Sequence as Frames
 
 Floats = NDArray[np.floating]
-LIT = ("sample", "white", "colour", "reference", "target", "sphere")
 _ORIGIN = np.zeros(3)
 # How far a rig may be from what its builder believes, seen on the sample.
 _OFF_MM = 4.0
@@ -99,36 +96,6 @@ class Scene:
         distance = self.placement.distance_mm(frame, at)
         near = 1.0 if distance is None or nominal_mm is None else (nominal_mm / distance) ** 2
         return float(light[2]) * near
-
-
-def lamp_factors(sequence: Frames, radiometry: Radiometry) -> tuple[list[int], Lamp]:
-    """Frames lit by the lamp, and its brightness in each.
-
-    Raises:
-        CalibrationError: a reading of the monitor that is none.
-    """
-    lit = list(sequence.of_kind(*LIT))
-    frames = [sequence.frames[i] for i in lit]
-    time = np.array([np.nan if f.time_s is None else f.time_s for f in frames])
-    readings = [f.lamp for f in frames if f.lamp is not None]
-    if frames and len(readings) == len(frames):
-        return lit, lamps.from_monitor(readings, [f.file for f in frames], time)
-    references = sequence.of_kind("reference")
-    if not references or any(sequence.frames[i].time_s is None for i in [*references, *lit]):
-        ones = np.ones(len(lit))
-        note = "no lamp monitor and no timed reference frames: the lamp is taken as steady"
-        return lit, Lamp("none", ones, float("nan"), time, ones, note)
-    merged = [radiometry.radiance(sequence, [i]) for i in references]
-    seen = np.all([np.isfinite(m.radiance) for m in merged], axis=0)
-    if seen.mean() < 0.01:
-        raise CalibrationError(
-            f"{sequence.frames[references[0]].file}: the reference frames saturate",
-            remedy="capture them at a shorter exposure",
-        )
-    level = [float(m.radiance[seen].mean(dtype=float)) for m in merged]
-    sd = [float(np.sqrt(m.variance[seen].mean(dtype=float) / seen.sum())) for m in merged]
-    at = [float(sequence.frames[i].time_s or 0) for i in references]
-    return lit, lamps.from_references(at, level, sd, time)
 
 
 def measure_stray(scene: Scene) -> tuple[Stray, dict[str, Any]]:

@@ -11,13 +11,12 @@ import numpy as np
 from btfkit import documents
 from btfkit.calibration.calibration import Calibration, Section
 from btfkit.calibration.colours import ColourCorrection
+from btfkit.calibration.lamp_stage import LIT, lamp_factors, lamp_frames
 from btfkit.calibration.noise import Fitted
 from btfkit.calibration.placement import Placement, nominal, of_directions
 from btfkit.calibration.radiometry import Radiometry
 from btfkit.calibration.references import (
-    LIT,
     Scene,
-    lamp_factors,
     measure_colour,
     measure_stray,
     measure_white,
@@ -110,7 +109,9 @@ def fingerprint(sequence: Frames, name: str, found: Calibration, placed: Placeme
 def _frames_of(sequence: Frames, name: str) -> Sequence[int]:
     if name == "radiometry":
         return frames_used(sequence)
-    kinds = {"lamp": "reference", "stray": "colour", "white": "white", "colour": "colour"}
+    if name == "lamp":
+        return lamp_frames(sequence)
+    kinds = {"stray": "colour", "white": "white", "colour": "colour"}
     return sequence.of_kind(kinds[name])
 
 

@@ -37,6 +37,7 @@ class FakeRig:
     Attributes:
         sensor: counts. drift: of the lamp from the first frame to the last. monitor: whether it
             is read. stray: share of the mean light that is everywhere. prnu: of pixels.
+        flicker: of the lamp from frame to frame, one deviation.
         slow: what the shortest exposure really is, over what it is said to be.
     """
 
@@ -48,6 +49,7 @@ class FakeRig:
     stray: float = 0.01
     prnu: float = 0.01
     slow: float = 1.0
+    flicker: float = 0.0
     lamp_mm: float = 500.0
     camera_mm: float = 400.0
 
@@ -102,7 +104,7 @@ class FakeRig:
 
     def write(self, folder: Path, *, poses=(0.2, 0.5), exposures=(0.02, 0.08), scale=14000.0):
         """A sequence: darks, flats, white, colours, references and a sample."""
-        rng = np.random.default_rng(5)
+        rng, flicker = np.random.default_rng(5), np.random.default_rng(6)
         (folder / "frames").mkdir(parents=True)
         frames: list[Frame] = []
         pixel, shading = self.maps()
@@ -116,6 +118,7 @@ class FakeRig:
                 group += 1
         for i, (kind, pose, t, group) in enumerate(shots):
             power = 1 + self.drift * i / len(shots)
+            power *= 1 + self.flicker * flicker.standard_normal()
             true_t = t * (self.slow if t == min(exposures) else 1)
             if kind == "dark":
                 light = np.zeros((self.height, self.width))

@@ -260,6 +260,24 @@ def test_without_a_monitor_the_lamp_is_followed_by_references(tmp_path):
     assert "taken as steady" in found.section("lamp").data["note"]
 
 
+def test_a_lamp_that_flickers_without_a_monitor_is_followed_within_each_pose(tmp_path):
+    rig = replace(RIG, monitor=False, slow=1.0, drift=0.0, flicker=0.02)
+    found, _ = stages.calibrate(Sequence.open(rig.write(tmp_path / "run")))
+    lamp = found.section("lamp").data
+    assert "flicker of up to" in lamp["note"]
+    by_file = dict(zip(lamp["files"], lamp["factor"], strict=True))
+    flicker = np.random.default_rng(6)
+    sequence = Sequence.open(tmp_path / "run")
+    power = [1 + 0.02 * flicker.standard_normal() for _ in sequence.frames]
+    off = []
+    for short, long in sequence.groups("white", "colour", "sample").values():
+        files = [sequence.frames[i].file for i in (short, long)]
+        off.append(by_file[files[0]] / by_file[files[1]] / (power[short] / power[long]) - 1)
+    # The mean over all poses is that of an exposure time, and goes there.
+    assert np.std(off) < 2e-3
+    assert np.std([power[s] / power[t] for s, t in sequence.groups("white", "colour").values()]) > 0.015
+
+
 def test_patches_out_of_the_frame_are_named(folder):
     away = {**FakeRig().document()["target"]["white"], "centre_mm": [80, 0, 0]}
     with pytest.raises(CalibrationError, match="the white reference is expected at column .* out of"):
