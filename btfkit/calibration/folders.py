@@ -79,7 +79,7 @@ def figures(found: Calibration) -> dict[str, Any]:
     if "stray" in found.sections:
         out["stray_share"] = found.sections["stray"].data["share"]
     if "white" in found.sections:
-        out["scale_sd"] = max(found.sections["white"].data["sd"])
+        out["scale_sd"] = found.sections["white"].data["budget"]["together"]
     if "colour" in found.sections:
         data = found.sections["colour"].data
         out["delta_e"] = data["mean_left_out"]

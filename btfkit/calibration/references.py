@@ -130,8 +130,11 @@ def measure_stray(scene: Scene) -> tuple[Stray, dict[str, Any]]:
     return found, {"share": found.share, **found.fitted.record()}
 
 
-def measure_white(scene: Scene) -> tuple[Scale, dict[str, Any]]:
+def measure_white(scene: Scene, lamp_sd: float = 0.0) -> tuple[Scale, dict[str, Any]]:
     """The absolute scale from the white reference.
+
+    Args:
+        scene: with stray light removed. lamp_sd: relative deviation of the lamp's factors.
 
     Raises:
         CalibrationError: no frames or no description of it, or frames that cannot be used.
@@ -149,11 +152,14 @@ def measure_white(scene: Scene) -> tuple[Scale, dict[str, Any]]:
     at = np.asarray(entry.get("centre_mm", _ORIGIN), float)
     frames = [scene.sequence.frames[group[0]] for group in groups]
     nominal = _near(scene, frames[0])
-    levels, directions, near, shifts = [], [], [], []
+    levels, directions, near, shifts, glare = [], [], [], [], []
     for group, frame in zip(groups, frames, strict=True):
         merged = scene.merged(group)
         shifts.append(scene.shift(merged, frame))
         levels.append(scene.level(merged, entry, frame, shifts[-1]))
+        whole, own = merged.radiance, levels[-1].mean
+        lit = np.isfinite(whole).any() and np.isfinite(own).all() and bool(np.all(own > 0))
+        glare.append(float(np.nanmean(whole)) / float(own.mean()) if lit else 0.0)
         directions.append(scene.placement.directions(frame, at))
         distance = scene.placement.distance_mm(frame, at)
         near.append(1.0 if distance is None or nominal is None else (nominal / distance) ** 2)
@@ -162,8 +168,17 @@ def measure_white(scene: Scene) -> tuple[Scale, dict[str, Any]]:
         light=np.array([d[0] for d in directions]), view=np.array([d[1] for d in directions]),
         files=[f.file for f in frames], irradiance=near,
     )  # fmt: skip
+    stray_sd = 0.0 if scene.stray is None else scene.stray.fitted.sd.get("share", 0.0)
+    budget = {
+        "white frames": float(found.sd.max()),
+        "lamp": lamp_sd,
+        "stray light": stray_sd * float(np.mean(glare)),
+        "angular model of the white": diffuser.residual,
+        "certificate": float(entry.get("uncertainty", 0.0)),
+    }
+    budget["together"] = float(np.sqrt(sum(v**2 for v in budget.values())))
     data = {
-        **found.record(), "files": [f.file for f in frames], "distance_mm": nominal,
+        **found.record(), "budget": budget, "files": [f.file for f in frames], "distance_mm": nominal,
         "diffuser_residual": diffuser.residual, "placement": scene.placement.source,
         "spread": [x.spread for x in levels], "shift_px": np.array(shifts).tolist(),
     }  # fmt: skip

@@ -134,6 +134,7 @@ def _white(data: Mapping[str, Any]) -> str:
         ("A factor of 1", f"{scale} counts a second"),
         ("Known to", ", ".join(f"{100 * v:.2f} %" for v in data["sd"])),
         ("Places from", data["placement"]),
+        *((f"Uncertainty: {name}", f"{100 * v:.3f} %") for name, v in data["budget"].items()),
     ]
     names = [Path(name).name for name in data["files"]]
     off = [100 * v for v in data["frames"]]

@@ -161,7 +161,8 @@ def _made(
     if name == "stray":
         _, data = measure_stray(scene)
     elif name == "white":
-        _, data = measure_white(scene)
+        lamp_sd = found.sections["lamp"].data["sd"] if "lamp" in found.sections else None
+        _, data = measure_white(scene, lamp_sd or 0.0)
     else:
         scale, nominal_mm = scale_of(found)
         _, data = measure_colour(scene, scale, nominal_mm)
@@ -181,8 +182,9 @@ def stray_of(found: Calibration) -> Stray | None:
     """The stray light of a calibration; None where it was not measured."""
     if "stray" not in found.sections:
         return None
-    share = float(found.sections["stray"].data["share"])
-    return Stray(share, Fitted({"share": share}, {}, 0.0, 0.0))
+    data = found.sections["stray"].data
+    share = float(data["share"])
+    return Stray(share, Fitted({"share": share}, dict(data["sd"]), 0.0, 0.0))
 
 
 def scale_of(found: Calibration) -> tuple[Scale, float | None]:

@@ -101,7 +101,8 @@ def from_document(section: Any) -> Diffuser:
     "angular": [a, b, c], the factor over the reflectance being
     a + b (cos_light + cos_view) + c cos_light cos_view, or
     "incidence_deg": 8 and "table": [[theta_light, theta_view, phi, factor], ...] in degrees, phi
-    between the azimuths of light and view, scaled so that the reflectance holds there.
+    between the azimuths of light and view, scaled so that the reflectance holds there;
+    "uncertainty": 0.005 goes into the budget of the absolute scale.
 
     Raises:
         CalibrationError: no reflectance, or a table that is none.

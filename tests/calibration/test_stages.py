@@ -180,6 +180,26 @@ def test_missing_flats_are_named_and_a_gain_stands_in(folder):
         stages.calibrate(bare)
 
 
+def test_one_exposure_only_calibrates_and_says_what_it_cannot_tell(folder):
+    def single(frame):
+        return None if frame.exposure_s == 0.02 and frame.kind not in ("dark", "flat") else frame
+
+    found, _ = stages.calibrate(edited(folder, frames=single))
+    assert any("no exposure series" in n for n in found.section("radiometry").data["notes"])
+    assert found.section("radiometry").data["exposure_factors"] == []
+    assert max(abs(off) for off in found.section("colour").data["greys"].values()) < 1e-2
+
+
+def test_the_budget_of_the_absolute_scale_adds_up(calibrated, folder):
+    budget = calibrated[0].section("white").data["budget"]
+    parts = [v for name, v in budget.items() if name != "together"]
+    assert budget["together"] == pytest.approx(np.sqrt(np.sum(np.square(parts))))
+    assert 0 < budget["stray light"] < 1e-3
+    white = {**FakeRig().document()["target"]["white"], "uncertainty": 0.005}
+    found, _ = stages.calibrate(edited(folder, target={"white": white}), calibrated[0])
+    assert found.section("white").data["budget"]["together"] > 0.005
+
+
 def test_a_missing_saturation_level_is_named(folder):
     with pytest.raises(CalibrationError, match=r"says no sensor\.white; add it under sensor"):
         stages.calibrate(edited(folder, sensor={"white": None}))
