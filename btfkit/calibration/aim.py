@@ -83,9 +83,7 @@ def _uneven(grey: Floats, noise: Floats, box: NDArray[np.intp], reach: int) -> F
         def at(rows: Any, cols: Any) -> Floats:
             return np.asarray(total[rows[:, :, None], cols[:, None, :]])
 
-        return (
-            at(bottom + 1, right + 1) - at(top, right + 1) - at(bottom + 1, left) + at(top, left)
-        )
+        return at(bottom + 1, right + 1) - at(top, right + 1) - at(bottom + 1, left) + at(top, left)
 
     area = (box[:, 2] - box[:, 0] + 1) * (box[:, 3] - box[:, 1] + 1)
     mean, square, expected = (inside(total) / area[:, None, None] for total in sums)
@@ -95,7 +93,8 @@ def _uneven(grey: Floats, noise: Floats, box: NDArray[np.intp], reach: int) -> F
 
 def _evened(merged: Merged) -> tuple[Floats, Floats]:
     """(h, w) brightness without the mosaic, means of 2 x 2, and its variance; holes are filled
-    with the median."""
+    with the median.
+    """
     value, variance = merged.radiance, merged.variance
     if value.ndim == 3:
         value, variance = value.mean(axis=2), variance.mean(axis=2) / value.shape[2]

@@ -153,7 +153,9 @@ def _maps(path: Path, digest: Any) -> dict[str, NDArray[Any]]:
     if not beside.is_file():
         raise FormatError(beside, "is not there", remedy=remedy)
     if hashlib.sha256(beside.read_bytes()).hexdigest() != digest:
-        raise FormatError(beside, "is not the file that the document was written with", remedy=remedy)
+        raise FormatError(
+            beside, "is not the file that the document was written with", remedy=remedy
+        )
     try:
         with np.load(beside, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}

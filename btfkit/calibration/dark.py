@@ -24,7 +24,8 @@ class Dark:
     """The dark model: black + current * 2^((T - T0) / doubling) * exposure, counts.
 
     Attributes:
-        black: (h, w) counts; what differs between pixels, as far as it is not noise. current: counts a second at `temperature_c`, mean over the sensor.
+        black: (h, w) counts; what differs between pixels, as far as it is not noise.
+        current: counts a second at `temperature_c`, mean over the sensor.
         temperature_c: T0, or None where no frame says it. doubling_k: kelvin.
         read: deviation of a count, without rounding and without what differs between pixels, or
             None where no two frames of one exposure are there.
@@ -78,7 +79,9 @@ def fit_dark(
     black, current, doubling, fitted = _levels(level, exposure, warm, reference)
     rate = np.full(len(counts), current)
     if reference is not None:
-        rate = current * 2 ** ((np.where(np.isfinite(warm), warm, reference) - reference) / doubling)
+        rate = current * 2 ** (
+            (np.where(np.isfinite(warm), warm, reference) - reference) / doubling
+        )
     mean, square = np.zeros(counts[0].shape), np.zeros(counts[0].shape)
     for frame, dark, t in zip(counts, rate, exposure, strict=True):
         value = frame - black - dark * t

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, final
 
 import numpy as np
@@ -69,7 +70,7 @@ def refine_exposures(
     order = np.argsort(-nominal)
     log, variance = np.zeros(len(nominal)), np.zeros(len(nominal))
     overlap = np.zeros(len(nominal), np.intp)
-    for longer, shorter in zip(order[:-1], order[1:], strict=True):
+    for longer, shorter in pairwise(order):
         ratios, count = [], 0
         for i, frames in enumerate(series):
             _, _, light = checked(frames, nominal, 1.0 if lamp is None else lamp[i])
@@ -98,7 +99,8 @@ def _ratios(
 ) -> tuple[list[float], int]:
     """Ratios shorter / longer of interleaved parts of the pixels, and how many pixels."""
     long, short = (
-        noise.linear(np.asarray(frames[i], float) - noise.black) - np.asarray(noise.dark) * nominal[i]
+        noise.linear(np.asarray(frames[i], float) - noise.black)
+        - np.asarray(noise.dark) * nominal[i]
         for i in (longer, shorter)
     )
     ratio = nominal[shorter] / nominal[longer]

@@ -127,7 +127,9 @@ def _one(
             f"{frame}: one white frame for {len(stems)} lights, named like none of them",
             remedy="name it like the photograph whose light it was taken under",
         )
-    far = [p.name for p, x in zip(table.files, table.lights, strict=True) if x and x.position is None]
+    far = [
+        p.name for p, x in zip(table.files, table.lights, strict=True) if x and x.position is None
+    ]
     own = table.lights[stems.index(frame.stem.lower())]
     if far or own is None:
         raise CalibrationError(

@@ -48,7 +48,7 @@ def find_spot(picture: Floats, sphere: Sphere, optics: Optics, *, floor: float) 
         None where nothing on the sphere stands out as one spot.
     """
     radius = int(np.ceil(sphere.radius_px))
-    column, row = (int(round(float(x))) for x in sphere.pixel)
+    column, row = (round(float(x)) for x in sphere.pixel)
     top, left = max(row - radius, 0), max(column - radius, 0)
     window = picture[top : row + radius + 1, left : column + radius + 1]
     rows, cols = np.indices(window.shape)
@@ -79,9 +79,7 @@ def find_spot(picture: Floats, sphere: Sphere, optics: Optics, *, floor: float) 
     return Spot(point, light, pixel, _deviation(sphere, pixel, int(blob.sum())))
 
 
-def _surroundings(
-    blob: Any, disc: Any
-) -> tuple[Any, Any]:
+def _surroundings(blob: Any, disc: Any) -> tuple[Any, Any]:
     """A spot with its soft edge, and a ring about it: a spot of few pixels is mostly edge."""
     from scipy.ndimage import binary_dilation
 

@@ -74,9 +74,7 @@ def from_monitor(reading: ArrayLike, files: Sequence[str], time_s: ArrayLike) ->
     return Lamp("monitor", values / middle, 0.0, time, values / middle)
 
 
-def from_references(
-    time_s: ArrayLike, level: ArrayLike, sd: ArrayLike, at_s: ArrayLike
-) -> Lamp:
+def from_references(time_s: ArrayLike, level: ArrayLike, sd: ArrayLike, at_s: ArrayLike) -> Lamp:
     """Factors from one pose and exposure that the run measured again and again.
 
     Between references the factor is interpolated. How well that does is tried by leaving out
@@ -97,8 +95,8 @@ def from_references(
     at = np.asarray(at_s, float)
     if not value.size or not np.all(value > 0) or not np.all(np.isfinite(time)):
         raise CalibrationError(
-            f"{value.size} reference frames, levels {value.tolist()[:5]}, times {time.tolist()[:5]}; "
-            "expected lit references with times",
+            f"{value.size} reference frames, levels {value.tolist()[:5]}, "
+            f"times {time.tolist()[:5]}; expected lit references with times",
             remedy="repeat a reference pose during the run, and write time_s",
         )
     relative = value / np.median(value)

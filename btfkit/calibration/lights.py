@@ -59,7 +59,15 @@ def locate(spots: Sequence[Spot], origin: Floats) -> Light:
     """
     direction, sd, residual = _common_direction(spots)
     if len(spots) < 2:
-        return Light(direction, None, sd, np.inf, np.nan, 1, "one sphere tells no distance: the direction is that from where it shows the light")
+        return Light(
+            direction,
+            None,
+            sd,
+            np.inf,
+            np.nan,
+            1,
+            "one sphere tells no distance: the direction is that from where it shows the light",
+        )
     position, covariance, angles, used = _intersection(list(spots))
     away = position - origin
     distance = float(np.linalg.norm(away))

@@ -62,8 +62,8 @@ class Radiometry:
             if np.ndim(noise.black) == 2 and counts.shape != np.shape(noise.black):
                 h, w = np.shape(noise.black)
                 raise CalibrationError(
-                    f"{frame.file} has {counts.shape[1]} x {counts.shape[0]} values; the sensor was "
-                    f"calibrated with {w} x {h}",
+                    f"{frame.file} has {counts.shape[1]} x {counts.shape[0]} values; the sensor "
+                    f"was calibrated with {w} x {h}",
                     remedy="leave the frame out, or calibrate anew",
                 )
         merged = merge_exposures(raw, exposure, noise, lamp=lamp)

@@ -65,7 +65,9 @@ class Scene:
     def groups(self, kind: str) -> list[tuple[int, ...]]:
         """Frames of each pose of a kind, at most 24 poses."""
         found = list(self.sequence.groups(kind).values())
-        chosen = np.unique(np.linspace(0, len(found) - 1, min(_MOST_GROUPS, len(found))).astype(int))
+        chosen = np.unique(
+            np.linspace(0, len(found) - 1, min(_MOST_GROUPS, len(found))).astype(int)
+        )
         return [found[i] for i in chosen]
 
     def mask(
@@ -75,9 +77,7 @@ class Scene:
         h, w = merged.radiance.shape[:2]
         return mask_of(entry, frame, self.placement, (h, w), shift)
 
-    def level(
-        self, merged: Merged, entry: Mapping[str, Any], frame: Frame, shift: Floats
-    ) -> Level:
+    def level(self, merged: Merged, entry: Mapping[str, Any], frame: Frame, shift: Floats) -> Level:
         """What a patch reads in a merged frame."""
         return level_of(merged, self.mask(merged, entry, frame, shift), self.colours(merged))
 
@@ -104,7 +104,11 @@ def measure_stray(scene: Scene) -> tuple[Stray, dict[str, Any]]:
     Raises:
         CalibrationError: no greys, or nothing that shows them.
     """
-    greys = [p for p in _patches(scene) if np.ptp(p["reflectance"]) <= _NEUTRAL * np.mean(p["reflectance"])]
+    greys = [
+        p
+        for p in _patches(scene)
+        if np.ptp(p["reflectance"]) <= _NEUTRAL * np.mean(p["reflectance"])
+    ]
     groups = scene.groups("colour")
     if len(greys) < 3 or not groups:
         raise CalibrationError(
@@ -124,7 +128,9 @@ def measure_stray(scene: Scene) -> tuple[Stray, dict[str, Any]]:
         for patch in greys:
             mask = scene.mask(merged, patch, frame, shift)
             values.append(level_of(merged, mask, colours).mean)
-            expected.append(float(np.mean(patch["reflectance"])) * scene.lit(patch, frame, _near(scene, frame)))
+            expected.append(
+                float(np.mean(patch["reflectance"])) * scene.lit(patch, frame, _near(scene, frame))
+            )
             around.append(mean / shading[mask].mean())
     found = fit_stray(values, expected, around)
     return found, {"share": found.share, **found.fitted.record()}
@@ -178,16 +184,17 @@ def measure_white(scene: Scene, lamp_sd: float = 0.0) -> tuple[Scale, dict[str, 
     }
     budget["together"] = float(np.sqrt(sum(v**2 for v in budget.values())))
     data = {
-        **found.record(), "budget": budget, "files": [f.file for f in frames], "distance_mm": nominal,
-        "diffuser_residual": diffuser.residual, "placement": scene.placement.source,
-        "spread": [x.spread for x in levels], "shift_px": np.array(shifts).tolist(),
+        **found.record(), "budget": budget, "files": [f.file for f in frames],
+        "distance_mm": nominal, "diffuser_residual": diffuser.residual,
+        "placement": scene.placement.source, "spread": [x.spread for x in levels],
+        "shift_px": np.array(shifts).tolist(),
     }  # fmt: skip
     return found, data
 
 
-def measure_colour(scene: Scene, scale: Scale, nominal_mm: float | None) -> tuple[
-    ColourCorrection, dict[str, Any]
-]:
+def measure_colour(
+    scene: Scene, scale: Scale, nominal_mm: float | None
+) -> tuple[ColourCorrection, dict[str, Any]]:
     """The correction of colours from the patches beside the sample.
 
     Args:

@@ -15,8 +15,10 @@ from btfkit.calibration.rti import LightTable
 from btfkit.files import whole
 
 Rows = Sequence[tuple[str, str]]
-_STYLE = """body { font: 15px/1.5 system-ui, sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em }
-table { border-collapse: collapse } td, th { padding: .15em .8em .15em 0; vertical-align: top; text-align: left }
+_STYLE = """body { font: 15px/1.5 system-ui, sans-serif; max-width: 60em; margin: 2em auto;
+  padding: 0 1em }
+table { border-collapse: collapse }
+td, th { padding: .15em .8em .15em 0; vertical-align: top; text-align: left }
 h2 { margin-top: 2em } svg { max-width: 100%; height: auto } .note { color: #a33 }"""
 
 
@@ -35,16 +37,26 @@ def write_report(
     for name, write in _SECTIONS.items():
         if name in calibration.sections:
             parts.append(f"<h2>{name.capitalize()}</h2>" + write(calibration.sections[name].data))
-    for name in calibration.sections.keys() - _SECTIONS.keys():
-        parts.append(f"<h2>{html.escape(name.capitalize())}</h2>" + _numbers(calibration.sections[name].data))
+    parts += [
+        f"<h2>{html.escape(name.capitalize())}</h2>" + _numbers(section.data)
+        for name, section in calibration.sections.items()
+        if name not in _SECTIONS
+    ]
     if lights is not None and len(lights):
-        drawn = plots.svg(plots.sky(lights, np.arange(len(lights)), "pose"), polar=True, size=(5, 4))
+        drawn = plots.svg(
+            plots.sky(lights, np.arange(len(lights)), "pose"), polar=True, size=(5, 4)
+        )
         parts.append("<h2>Coverage</h2><p>Lights over the sample, seen from above.</p>" + drawn)
     _write(path, title, parts, force)
 
 
 def write_light_report(
-    table: LightTable, falloff: Mapping[str, Any] | None, path: Path, *, title: str, force: bool = False
+    table: LightTable,
+    falloff: Mapping[str, Any] | None,
+    path: Path,
+    *,
+    title: str,
+    force: bool = False,
 ) -> None:
     """The report of the lights of a folder of photographs."""
     record = table.record()
@@ -61,8 +73,9 @@ def write_light_report(
     directions = np.array([light.direction for light in found])
     error = np.degrees([light.sd for light in found])
     spheres = [
-        (f"Sphere {i + 1}", f"centre {s.pixel[0]:.2f}, {s.pixel[1]:.2f}, radius {s.radius_px:.2f} px; "
-         f"outline {s.rms_px:.2f} px rms, {100 * s.coverage:.0f} % seen, axes 1 : {s.axis_ratio:.4f}")
+        (f"Sphere {i + 1}", f"centre {s.pixel[0]:.2f}, {s.pixel[1]:.2f}, "
+         f"radius {s.radius_px:.2f} px; outline {s.rms_px:.2f} px rms, "
+         f"{100 * s.coverage:.0f} % seen, axes 1 : {s.axis_ratio:.4f}")
         for i, s in enumerate(table.spheres)
     ]  # fmt: skip
     parts = [_table(rows), "<h2>Lights</h2>"]
@@ -70,7 +83,9 @@ def write_light_report(
     residual = [0.0 if np.isnan(x.residual) else float(np.degrees(x.residual)) for x in found]
     if any(residual):
         names = [p.name for p, x in zip(table.files, table.lights, strict=True) if x is not None]
-        parts.append(plots.svg(plots.bars(names, residual, "spheres disagree, degrees"), size=(7, 3)))
+        parts.append(
+            plots.svg(plots.bars(names, residual, "spheres disagree, degrees"), size=(7, 3))
+        )
     parts.append("<h2>Spheres</h2>" + _table(spheres))
     if falloff is not None:
         parts.append("<h2>Fall-off</h2>" + _numbers(falloff))
@@ -94,20 +109,31 @@ def _radiometry(data: Mapping[str, Any]) -> str:
     parts = []
     if "transfer" in data:
         found = data["transfer"]
-        rows.append(("Gain is known to", _percent(found["sd"]["gain_e_per_count"], found["gain_e_per_count"])))
+        rows.append(
+            (
+                "Gain is known to",
+                _percent(found["sd"]["gain_e_per_count"], found["gain_e_per_count"]),
+            )
+        )
         rows.append(("Condition of the fit", f"{found['condition']:.3g}"))
         parts.append(plots.svg(plots.transfer(found)))
     if "linearity" in data:
         found = data["linearity"]
         after = f"{100 * found['residual_after']:.3f} %"
-        rows.append(("Linearity", f"{100 * found['residual_before']:.3f} % off, {after} after its curve"))
+        rows.append(
+            ("Linearity", f"{100 * found['residual_before']:.3f} % off, {after} after its curve")
+        )
         parts.append(plots.svg(plots.linearity(found)))
     if "sensitivity" in data:
         rows.append(("Pixels differ by", f"{100 * data['sensitivity']['sd']:.2f} % rms"))
         rows.append(("Dead or hot pixels", str(data["sensitivity"]["dead_pixels"])))
     for nominal, factor in data["exposure_factors"]:
         rows.append((f"Exposure {nominal:g} s", f"really {nominal * factor:.6g} s"))
-    held = {k: v for part in ("dark", "transfer", "linearity") for k, v in data.get(part, {}).get("held", {}).items()}
+    held = {
+        k: v
+        for part in ("dark", "transfer", "linearity")
+        for k, v in data.get(part, {}).get("held", {}).items()
+    }
     rows += [(f"{name} is held", why) for name, why in held.items()]
     return _table(rows) + "".join(parts) + _notes(data["notes"])
 
@@ -143,11 +169,16 @@ def _white(data: Mapping[str, Any]) -> str:
 
 def _colour(data: Mapping[str, Any]) -> str:
     rows = [
-        ("ΔE2000, left out", f"{data['mean_left_out']:.3f} mean, {data['worst_left_out']:.3f} worst"),
+        (
+            "ΔE2000, left out",
+            f"{data['mean_left_out']:.3f} mean, {data['worst_left_out']:.3f} worst",
+        ),
         ("ΔE2000, fitted", f"{float(np.mean(data['fitted'])):.3f} mean"),
         ("Correction", "matrix" if len(data["matrix"][0]) == 3 else "root polynomial of degree 2"),
     ]
-    parts = plots.svg(plots.bars(data["patches"], data["left_out"], "ΔE2000, left out"), size=(7, 3))
+    parts = plots.svg(
+        plots.bars(data["patches"], data["left_out"], "ΔE2000, left out"), size=(7, 3)
+    )
     if data["greys"]:
         off = [100 * v for v in data["greys"].values()]
         parts += plots.svg(plots.bars(list(data["greys"]), off, "grey patches off, %"))
@@ -155,17 +186,26 @@ def _colour(data: Mapping[str, Any]) -> str:
 
 
 def _geometry(data: Mapping[str, Any]) -> str:
-    rows = [(f"Residual of each {kind}", f"{rms:.3f} px rms") for kind, rms in data["residuals_px"].items()]
-    rows += [("Observations left out", str(data["rejected"])), ("Condition", f"{data['condition']:.3g}")]
+    rows = [
+        (f"Residual of each {kind}", f"{rms:.3f} px rms")
+        for kind, rms in data["residuals_px"].items()
+    ]
+    rows += [
+        ("Observations left out", str(data["rejected"])),
+        ("Condition", f"{data['condition']:.3g}"),
+    ]
     if data["held"]:
         rows.append(("Held, since the frames do not tell them", ", ".join(data["held"])))
     views = data["view_rms_px"]
-    drawn = plots.svg(plots.bars([str(i) for i in range(len(views))], views, "residual of a view, px rms"))
+    drawn = plots.svg(
+        plots.bars([str(i) for i in range(len(views))], views, "residual of a view, px rms")
+    )
     return _table(rows) + drawn
 
 
 _SECTIONS = {
-    "radiometry": _radiometry, "lamp": _lamp, "geometry": _geometry, "stray": _stray, "white": _white, "colour": _colour,
+    "radiometry": _radiometry, "lamp": _lamp, "geometry": _geometry, "stray": _stray,
+    "white": _white, "colour": _colour,
 }  # fmt: skip
 
 
@@ -192,8 +232,10 @@ def _notes(notes: Sequence[str]) -> str:
 
 def _write(path: Path, title: str, parts: Sequence[str], force: bool) -> None:
     page = (
-        f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f"<style>{_STYLE}</style>\n<h1>{html.escape(title)}</h1>\n" + "\n".join(parts) + "\n</html>\n"
+        '<!doctype html>\n<html lang="en"><meta charset="utf-8">'
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style>\n<h1>{html.escape(title)}</h1>\n"
+        + "\n".join(parts)
+        + "\n</html>\n"
     )
     with whole(path, force=force) as partial:
         partial.write_text(page, encoding="utf-8")

@@ -217,7 +217,9 @@ def fit_sensitivity(
             at = (slice(row, None, period[0]), slice(col, None, period[1]))
             # Every colour by itself: the colour of the flat is not that of the lens.
             shading[at] /= np.quantile(shading[at], 0.999)
-    return Sensitivity(pixel, float(np.sqrt(told)), float(np.sqrt(own)), shading, int(unusable.sum()))
+    return Sensitivity(
+        pixel, float(np.sqrt(told)), float(np.sqrt(own)), shading, int(unusable.sum())
+    )
 
 
 def _smoothed(plane: Floats, sigma: float) -> Floats:

@@ -168,8 +168,8 @@ def _check(table: LightTable, folder: Path) -> None:
     ratio = max(sphere.axis_ratio for sphere in table.spheres)
     if table.optics.focal_px is None and ratio > 1.02:
         warnings.warn(
-            f"{folder}: an outline is an ellipse, longer by {100 * (ratio - 1):.1f} %: the camera is "
-            "near; --focal-px makes the directions right",
+            f"{folder}: an outline is an ellipse, longer by {100 * (ratio - 1):.1f} %: the camera "
+            "is near; --focal-px makes the directions right",
             stacklevel=3,
         )
 

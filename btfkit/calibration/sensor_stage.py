@@ -45,7 +45,9 @@ def fit_sensor(sequence: Sequence) -> tuple[Radiometry, dict[str, Any]]:
     if flats:
         noise, shading = _response(sequence, flats, noise, dark, details)
     else:
-        details["notes"].append("no flat frames: neither linearity, nor what differs between pixels")
+        details["notes"].append(
+            "no flat frames: neither linearity, nor what differs between pixels"
+        )
     cfa = sequence.sensor.cfa
     radiometry = Radiometry(
         noise, cfa, None if dark is None else dark.temperature_c,
@@ -70,8 +72,8 @@ def _dark(sequence: Sequence, details: dict[str, Any]) -> Dark | None:
     dark = fit_dark([as_plane(sequence.image(i)) for i in indices], exposure, warm)
     if dark.clipped > 0.01:
         raise CalibrationError(
-            f"{frames[0].file}: {100 * dark.clipped:.0f} % of dark counts are 0: the black level is "
-            "cut off, and with it half of the noise",
+            f"{frames[0].file}: {100 * dark.clipped:.0f} % of dark counts are 0: the black "
+            "level is cut off, and with it half of the noise",
             remedy="raise the camera's black level (offset)",
         )
     white = sequence.sensor.white
@@ -105,7 +107,9 @@ def _gain(sequence: Sequence, dark: Dark | None, details: dict[str, Any]) -> Noi
             found = photon_transfer(planes, black, white, read=read)
         except CalibrationError as error:
             first = sequence.frames[flats[0]].file
-            raise CalibrationError(f"{first} and others: {error.message}", remedy=error.remedy) from error
+            raise CalibrationError(
+                f"{first} and others: {error.message}", remedy=error.remedy
+            ) from error
         details["transfer"] = found.record()
         return NoiseModel(found.gain, found.read, white, black, current)
     if sensor.gain_e_per_dn is None:
@@ -128,7 +132,11 @@ def _gain(sequence: Sequence, dark: Dark | None, details: dict[str, Any]) -> Noi
 
 
 def _response(
-    sequence: Sequence, flats: list[int], noise: NoiseModel, dark: Dark | None, details: dict[str, Any]
+    sequence: Sequence,
+    flats: list[int],
+    noise: NoiseModel,
+    dark: Dark | None,
+    details: dict[str, Any],
 ) -> tuple[NoiseModel, Floats]:
     """The noise model with curve and sensitivity, and the shading of the lens."""
     frames = [sequence.frames[i] for i in flats]

@@ -47,7 +47,9 @@ class Optics:
         xy = self.centred(pixel)
         if self.focal_px is None:
             zero = np.zeros((*xy.shape[:-1], 1))
-            return np.concatenate([xy, zero], -1), np.broadcast_to([0.0, 0.0, -1.0], (*xy.shape[:-1], 3))
+            return np.concatenate([xy, zero], -1), np.broadcast_to(
+                [0.0, 0.0, -1.0], (*xy.shape[:-1], 3)
+            )
         z = np.full((*xy.shape[:-1], 1), -self.focal_px)
         unit = directions.normalize(np.concatenate([xy, z], axis=-1))
         return np.zeros_like(unit), unit

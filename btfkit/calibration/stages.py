@@ -24,7 +24,6 @@ from btfkit.calibration.references import (
 from btfkit.calibration.sensor_stage import fit_sensor, frames_used
 from btfkit.calibration.stray import Stray
 from btfkit.calibration.white import Scale
-from btfkit.errors import CalibrationError
 from btfkit.sequence import Sequence as Frames
 
 Progress = Callable[[float, float], None]
@@ -91,7 +90,9 @@ def fingerprint(sequence: Frames, name: str, found: Calibration, placed: Placeme
         "stage": name,
         "revision": _REVISION[name],
         "sensor": vars(sequence.sensor),
-        "earlier": {each: found.sections[each].inputs for each in earlier if each in found.sections},
+        "earlier": {
+            each: found.sections[each].inputs for each in earlier if each in found.sections
+        },
         "frames": [_frame_entry(sequence, i) for i in _frames_of(sequence, name)],
     }
     if name in ("stray", "white", "colour"):

@@ -52,11 +52,10 @@ class Stray:
         return Merged(radiance, merged.variance, merged.validity)
 
 
-def frame_means(
-    merged: Merged, shading: Floats, colours: NDArray[np.intp] | None
-) -> Floats:
+def frame_means(merged: Merged, shading: Floats, colours: NDArray[np.intp] | None) -> Floats:
     """(c,) mean radiance on the sensor, before the flat was divided out; what saturates counts
-    as the brightest that does not."""
+    as the brightest that does not.
+    """
     lens = shading if merged.radiance.ndim == 2 else shading[..., None]
     seen = merged.radiance * lens
     bright = float(np.nanmax(seen)) if np.isfinite(seen).any() else 0.0

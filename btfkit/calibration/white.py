@@ -78,7 +78,8 @@ def fit_diffuser(
     terms, table = _terms(light, view), np.asarray(factor, float)
     if len(table) < 2 * terms.shape[-1]:
         raise CalibrationError(
-            f"{len(table)} directions of the white reference; its model has {terms.shape[-1]} terms",
+            f"{len(table)} directions of the white reference; its model has "
+            f"{terms.shape[-1]} terms",
             remedy="give a table of at least twice as many, or a reflectance alone",
         )
     weights, _, condition, keep = solved(terms, table, 1 / table**2)

@@ -112,7 +112,7 @@ class FakeRig:
         shots += [("flat", 0.0, t, None) for t in (0.02, 0.02, 0.08, 0.08, 0.15, 0.15, 0.3, 0.3)]
         group = 0
         for kind in ("reference", "white", "colour", "sample", "reference", "white", "reference"):
-            for pose in (poses[:1] if kind == "reference" else poses):
+            for pose in poses[:1] if kind == "reference" else poses:
                 times = exposures[-1:] if kind == "reference" else exposures
                 shots += [(kind, pose, t, group) for t in times]
                 group += 1
