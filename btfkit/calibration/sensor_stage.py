@@ -21,6 +21,10 @@ from btfkit.sequence import Sequence
 Floats = NDArray[np.floating]
 # More frames than this say no more: the error falls with the root of their number.
 _MOST_DARKS, _MOST_FLATS, _MOST_GROUPS = 24, 24, 4
+# So many equal counts at the top, and three times as many as in the counts just below.
+_PILE, _NEAR_TOP = 50, 16
+# A frame without light has equal counts too.
+_DARKEST = 0.1
 _LIT = ("sample", "white", "colour", "reference", "target")
 
 
@@ -37,6 +41,7 @@ def fit_sensor(sequence: Sequence) -> tuple[Radiometry, dict[str, Any]]:
         CalibrationError: what neither frames nor sequence.json tell, and how to add it.
     """
     _check_iso(sequence)
+    _check_saturation(sequence)
     details: dict[str, Any] = {"notes": []}
     dark = _dark(sequence, details)
     noise = _gain(sequence, dark, details)
@@ -226,3 +231,37 @@ def _check_iso(sequence: Sequence) -> None:
             "for one",
             remedy="make a sequence of the frames of each, with darks and flats of its own",
         )
+
+
+def _check_saturation(sequence: Sequence) -> None:
+    """Refuse a saturation level above that of the sensor: what is cut off would count as light.
+
+    Raises:
+        CalibrationError: counts pile up below sensor.white.
+    """
+    white = float(sequence.sensor.need("white"))
+    step = 1 if sequence.sensor.cfa == "none" else 2
+    for i in frames_used(sequence):
+        image = as_plane(sequence.image(i))
+        if sequence.frames[i].kind == "dark" or image.dtype.kind != "u":
+            continue
+        planes = [image[row::step, col::step] for row in range(step) for col in range(step)]
+        for top, full in filter(None, (_piled(plane, white) for plane in planes)):
+            raise CalibrationError(
+                f"{sequence.frames[i].file}: {full} counts pile up at {top}, below sensor.white "
+                f"{white:g}",
+                remedy=f"write {top} as sensor.white into sequence.json",
+            )
+
+
+def _piled(plane: NDArray[Any], white: float) -> tuple[int, int] | None:
+    """The highest count below `white` and how many have it, where they are too many for noise.
+
+    Noise thins out towards its end; a level that cuts it off is full.
+    """
+    top = int(plane.max())
+    if not _DARKEST * white < top < white:
+        return None
+    full = int(np.count_nonzero(plane == top))
+    below = int(np.count_nonzero((plane < top) & (plane >= top - _NEAR_TOP)))
+    return (top, full) if full > _PILE and full > 3 * below else None

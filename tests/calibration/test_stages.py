@@ -203,6 +203,16 @@ def test_a_missing_saturation_level_is_named(folder):
         stages.calibrate(edited(folder, sensor={"white": None}))
 
 
+def test_counts_that_pile_up_below_the_saturation_level_are_named(folder):
+    sequence = Sequence.open(folder)
+    for i in range(len(sequence)):
+        path = folder / sequence.frames[i].file
+        path.write_bytes(counts.encode_png(np.minimum(sequence.image(i), 1500)))
+    with pytest.raises(CalibrationError, match=r"counts pile up at 1500, below sensor\.white 4095"):
+        stages.calibrate(sequence)
+    stages.calibrate(edited(folder, sensor={"white": 1500.0}))
+
+
 def test_missing_references_leave_their_stages_out_by_name(folder):
     found, _ = stages.calibrate(edited(folder, frames=no("white")))
     assert found.missing == {
