@@ -10,6 +10,7 @@ import click
 # Verb -> module with a function of the verb's name, and the line that `btfkit --help` shows.
 VERBS: dict[str, tuple[str, str]] = {
     "ingest": ("btfkit.cli.ingest", "Read any measured source into one native store."),
+    "calibrate": ("btfkit.cli.calibrate", "Calibrate a sequence; find lights in photographs."),
     "convert": ("btfkit.cli.convert", "Write a store in an interchange format."),
     "fit": ("btfkit.cli.fit", "Fit a model to a BTF, a relief or a query file."),
     "propagate": ("btfkit.cli.propagate", "Carry a fitted NeuBTF onto a guidance image."),

@@ -1,0 +1,80 @@
+"""`btfkit calibrate`: a sequence -> its calibration; photographs of mirror spheres -> lights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from btfkit.cli.bar import Bar
+from btfkit.cli.options import force_option, out_option
+from btfkit.cli.outcome import Outcome, verb
+
+
+@verb(
+    "calibrate",
+    example="btfkit calibrate run/\nbtfkit calibrate photographs/ --sphere-mm 25 -o coin.lp",
+)
+@click.argument("source", metavar="SEQUENCE", type=click.Path(path_type=Path))
+@out_option("By default SEQUENCE/calibration.json, or NAME.lp in a folder of photographs")
+@click.option(
+    "--spheres", type=click.Path(path_type=Path), help="Photographs of the spheres, taken first."
+)
+@click.option(
+    "--white", type=click.Path(path_type=Path), help="White frames, one a light, or a single one."
+)
+@click.option("--sphere-mm", type=float, help="Diameter of the largest sphere, millimetres.")
+@click.option("--focal-px", type=float, help="Focal length of a near camera, pixels.")
+@click.option(
+    "--transfer", default="srgb", show_default=True, help="Of photographs: srgb, linear or 2.2."
+)
+@force_option
+def calibrate_verb(
+    bar: Bar, *, source: Path, out: Path | None, force: bool, **options: Any
+) -> Outcome:
+    """Calibrate a captured sequence, or find the lights of photographs (RTI).
+
+    SEQUENCE: a folder with sequence.csv; stages whose frames and settings did not change are not
+    run again. A folder of photographs with one or several mirror spheres in view gives their
+    light directions (.lp), and positions where several spheres tell them.
+    """
+    from btfkit.calibration.folders import Photographs, calibrate_photographs, calibrate_sequence
+    from btfkit.sequence import TABLE
+
+    if not source.is_dir():
+        raise FileNotFoundError(f"{source} is not a folder")
+    if (source / TABLE).exists():
+        data = calibrate_sequence(source, out, force=force, progress=bar)
+        return Outcome(_of_sequence(data), data)
+    data = calibrate_photographs(source, out, Photographs(**options), force=force, progress=bar)
+    return Outcome(_of_lights(data), data)
+
+
+def _of_sequence(data: dict[str, Any]) -> str:
+    found = data["figures"]
+    parts = [f"gain {found['gain_e_per_count']:.3f} e/count, read noise {found['read_e']:.2f} e"]
+    if "lamp_drift" in found:
+        parts.append(f"lamp drift {100 * found['lamp_drift']:.2f} %")
+    if "scale_sd" in found:
+        parts.append(f"white {100 * found['scale_sd']:.2f} %")
+    if "delta_e" in found:
+        parts.append(f"dE2000 {found['delta_e']:.2f}")
+    lines = [f"{data['out']}: {', '.join(parts)}"]
+    lines.append(f"  ran {', '.join(data['ran']) or 'nothing: all inputs are unchanged'}")
+    lines += [f"  missing {name}: {why}" for name, why in data["missing"].items()]
+    return "\n".join(lines)
+
+
+def _of_lights(data: dict[str, Any]) -> str:
+    line = (
+        f"{data['out']}: {data['lights']} lights from {data['spheres']} spheres, "
+        f"error {data['error_deg']:.2f} degrees"
+    )
+    if data["positions"]:
+        line += f", {data['positions']} positions in {data['unit']}"
+    if data["falloff_rms"] is not None:
+        line += (
+            f"; fall-off divided out to {100 * data['falloff_rms']:.2f} % in {data['corrected']}"
+        )
+    return line
