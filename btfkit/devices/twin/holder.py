@@ -1,0 +1,131 @@
+"""The holder of the twin: a plate with board, patches and white reference, drawn once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit.devices.twin import layout
+from btfkit.devices.twin.geometry import Floats, Truth
+
+Image = NDArray[np.float32]
+# Reflectance of ink, paper, mount and of what lies beyond the plate.
+_INK, _PAPER, _MOUNT, _CLOTH = 0.04, 0.85, 0.06, 0.015
+
+
+@final
+class Plate:
+    """Reflectance of the plate in its own plane, each texel the mean over its area.
+
+    Args:
+        target: section of the description. truth: how far things are displaced.
+        texels_per_mm: of the drawing.
+
+    Attributes:
+        drawing: (H, W, 4) linear sRGB, and how much of a texel is white reference.
+        size_mm: (width, height) of what is drawn.
+    """
+
+    def __init__(self, target: Mapping[str, Any], truth: Truth, texels_per_mm: float) -> None:
+        across, down = layout.BOARD
+        margin = 4 * layout.SQUARE_MM
+        self.size_mm = (
+            across * layout.SQUARE_MM + margin, down * layout.SQUARE_MM + margin
+        )  # fmt: skip
+        self._scale = texels_per_mm
+        w, h = (round(side * texels_per_mm) for side in self.size_mm)
+        self.drawing = np.zeros((h, w, 4), np.float32)
+        self.drawing[..., :3] = _CLOTH
+        self._board()
+        half = layout.MOUNT_MM / 2
+        self._fill((-half, half), (-half, half), (_MOUNT,) * 3)
+        for patch, shift in zip(target["patches"], truth.displaced, strict=False):
+            self._patch(patch, shift)
+        self._patch(target["white"], truth.displaced[-1], white=1.0)
+
+    def texels(self, points: Image) -> Image:
+        """(..., 2) columns and rows of the drawing for x and y in mm."""
+        h, w = self.drawing.shape[:2]
+        scale = np.float32([self._scale, -self._scale])
+        return points * scale + np.float32([w / 2 - 0.5, h / 2 - 0.5])
+
+    def at(self, points: Image) -> Image:
+        """(h, w, 4) of the drawing at (h, w, 2) x and y in mm, between texels bilinear."""
+        where = self.texels(points)
+        return np.asarray(
+            cv2.remap(
+                self.drawing, where[..., 0], where[..., 1], cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_REPLICATE,
+            )
+        )  # fmt: skip
+
+    def _patch(self, entry: Mapping[str, Any], shift: Floats, *, white: float = 0.0) -> None:
+        (x, y), (w, h) = np.asarray(entry["centre_mm"][:2]) + shift, entry["size_mm"]
+        self._fill((x - w / 2, x + w / 2), (y - h / 2, y + h / 2), entry["reflectance"], white)
+
+    def _board(self) -> None:
+        across, down = layout.BOARD
+        left, top = -across * layout.SQUARE_MM / 2, down * layout.SQUARE_MM / 2
+        self._fill((left, -left), (-top, top), (_PAPER,) * 3)
+        for x, y, side, ink in board_cells():
+            self._fill(
+                (left + x, left + x + side), (top - y - side, top - y),
+                (_INK if ink else _PAPER,) * 3,
+            )  # fmt: skip
+
+    def _fill(
+        self,
+        x: tuple[float, float],
+        y: tuple[float, float],
+        reflectance: tuple[float, ...] | list[float],
+        white: float = 0.0,
+    ) -> None:
+        """Paint a rectangle; texels on its border get their share."""
+        h, w = self.drawing.shape[:2]
+        cols, across = _covered(w, x[0] * self._scale + w / 2, x[1] * self._scale + w / 2)
+        rows, down = _covered(h, h / 2 - y[1] * self._scale, h / 2 - y[0] * self._scale)
+        share = (down[:, None] * across)[..., None]
+        part = self.drawing[rows, cols]
+        part += share * (np.float32([*reflectance, white]) - part)
+
+
+def board_cells() -> list[tuple[float, float, float, bool]]:
+    """Squares of the board, then modules of its markers: left, top, side (mm, y down), inked.
+
+    As OpenCV's CharucoBoard of the same numbers has them.
+    """
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, layout.DICTIONARY))
+    board = cv2.aruco.CharucoBoard(
+        layout.BOARD, layout.SQUARE_MM, layout.MARKER_MM, dictionary
+    )
+    across, down = layout.BOARD
+    modules = dictionary.markerSize + 2
+    marked = {}
+    for number, corners in zip(board.getIds().ravel(), board.getObjPoints(), strict=True):
+        left, top = (float(c) for c in np.asarray(corners)[0, :2])
+        marked[int(left / layout.SQUARE_MM), int(top / layout.SQUARE_MM)] = (number, left, top)
+    cells: list[tuple[float, float, float, bool]] = []
+    for j in range(down):
+        for i in range(across):
+            ink = (i, j) not in marked
+            cells.append((i * layout.SQUARE_MM, j * layout.SQUARE_MM, layout.SQUARE_MM, ink))
+    side = layout.MARKER_MM / modules
+    for number, left, top in marked.values():
+        bits = dictionary.generateImageMarker(int(number), modules, borderBits=1)
+        for row in range(modules):
+            for col in range(modules):
+                if bits[row, col] == 0:
+                    cells.append((left + col * side, top + row * side, side, True))  # noqa: PERF401
+    return cells
+
+
+def _covered(count: int, low: float, high: float) -> tuple[slice, Image]:
+    """Texels that an interval touches, and the share of each that it covers."""
+    first, last = max(int(np.floor(low)), 0), min(int(np.ceil(high)), count)
+    edges = np.arange(first, last)
+    share = np.minimum(edges + 1, high) - np.maximum(edges, low)
+    return slice(first, last), np.asarray(np.clip(share, 0, 1), np.float32)
