@@ -7,36 +7,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
+from btfkit.devices.poses import Chains, Floats, Motion, rotation
 from btfkit.devices.twin.imperfections import Imperfections
-
-Floats = NDArray[np.float64]
-
-
-class Motion(NamedTuple):
-    """A rigid motion: x -> turn @ x + shift."""
-
-    turn: Floats
-    shift: Floats
-
-    def of(self, points: ArrayLike) -> Floats:
-        """(..., 3) points, moved."""
-        return np.asarray(points, float) @ self.turn.T + self.shift
-
-    def then(self, outer: Motion) -> Motion:
-        """This one, and `outer` after it."""
-        return Motion(outer.turn @ self.turn, outer.turn @ self.shift + outer.shift)
-
-    def inverse(self) -> Motion:
-        return Motion(self.turn.T, -self.turn.T @ self.shift)
-
-
-def rotation(axis: ArrayLike, angle: float) -> Floats:
-    """(3, 3) right-handed rotation about a unit vector (Rodrigues)."""
-    x, y, z = np.asarray(axis, float)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 @final
@@ -45,8 +18,7 @@ class Truth:
     """The rig as it is.
 
     Attributes:
-        lines: direction and point (mm) of each axis, lab frame at zero.
-        carries: axes that move each body, the base first.
+        chains: the axes as they stand, and what they carry.
         camera: rotation of the camera and its centre at zero; focal_px and centre_px (x, y).
         distortion: k1, k2 radial, p1, p2 tangential, of normalised coordinates.
         lamp: centre at zero, mm.
@@ -54,8 +26,7 @@ class Truth:
         spheres: (4, 3) centres, mm. displaced: (24 + 1, 2) of patches and white, mm.
     """
 
-    lines: Mapping[str, tuple[Floats, Floats]]
-    carries: Mapping[str, tuple[str, ...]]
+    chains: Chains
     camera: tuple[Floats, Floats]
     focal_px: Floats
     centre_px: Floats
@@ -88,8 +59,7 @@ class Truth:
         lens = imperfections.of("distortion", 1.0)
         board = _small_turn(off("holder", np.radians(0.01), 3))
         return Truth(
-            lines=lines,
-            carries={body: tuple(names) for body, names in nominal["carries"].items()},
+            chains=Chains(lines, nominal["carries"]),
             camera=(
                 turn @ np.asarray(camera["rotation"], float),
                 np.asarray(camera["position_mm"], float) + off("camera-pose", 1.0, 3),
@@ -104,20 +74,11 @@ class Truth:
             displaced=off("holder", 0.15, len(target["patches"]) + 1, 2),
         )
 
-    def body(self, name: str, angles: Mapping[str, float]) -> Motion:
-        """How the axes at `angles` have moved a body from where it is at zero, lab frame."""
-        moved = Motion(np.eye(3), np.zeros(3))
-        for axis in reversed(self.carries[name]):
-            direction, point = self.lines[axis]
-            turn = rotation(direction, angles[axis])
-            moved = moved.then(Motion(turn, point - turn @ point))
-        return moved
-
     def placed(self, angles: Mapping[str, float]) -> Placed:
         """Camera and lamp seen from the sample, with the axes at `angles` (true ones)."""
-        to_sample = self.body("sample", angles).inverse()
-        camera = self.body("camera", angles).then(to_sample)
-        lamp = self.body("light", angles).then(to_sample)
+        to_sample = self.chains.body("sample", angles).inverse()
+        camera = self.chains.body("camera", angles).then(to_sample)
+        lamp = self.chains.body("light", angles).then(to_sample)
         turn, centre = self.camera
         # Rows of `turn` are the camera's axes.
         return Placed(turn @ camera.turn.T, camera.of(centre), lamp.of(self.lamp), lamp.turn)
