@@ -7,6 +7,8 @@ process; a recording of either can stand in for both.
 from __future__ import annotations
 
 import errno
+import functools
+import importlib
 import json
 import struct
 import zlib
@@ -146,7 +148,8 @@ class UsbRig(Rig):
         self.description = _described(self.serial, text, hello.axes)
         axes = {each["name"]: _axis(each) for each in self.description["axes"]}
         sensor = self.description["sensor"]
-        limits = CameraLimits(*sensor["exposure_s"], tuple(sensor["isos"]))
+        shortest, longest = sensor["exposure_s"]
+        limits = CameraLimits(float(shortest), float(longest), tuple(map(float, sensor["isos"])))
         self.stage = UsbStage(self.link, axes, self._watchdog)
         self.camera = UsbCamera(self.link, tuple(axes), sensor, limits, self._watchdog)
         self.light = UsbLight(self.link, tuple(self.description["sources"]), self._watchdog)
@@ -344,7 +347,7 @@ class _Bulk(Transport):
 
     def recover(self) -> None:
         for endpoint in (ENDPOINT_OUT, ENDPOINT_IN):
-            self._tried(lambda endpoint=endpoint: self._device.clear_halt(endpoint))
+            self._tried(functools.partial(self._device.clear_halt, endpoint))
         for _ in range(16):
             if not self.read(0.001):
                 break
@@ -381,8 +384,6 @@ _NO_LIBUSB = 'libusb is missing: pip install "btfkit[usb]"'
 
 def _libusb() -> Any:
     """libusb as a wheel brings it, or the system's; None where there is neither."""
-    import importlib
-
     import usb.backend.libusb1
 
     try:

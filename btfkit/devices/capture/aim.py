@@ -45,8 +45,8 @@ class Aim:
         """(n, 4) turntable, camera_arm, light_turn, light_arm, radians, for (n, 3) directions."""
         theta_v, phi_v = directions.to_angles(view)
         theta_l, phi_l = directions.to_angles(light)
-        turn = _from_zero(-phi_v)
-        return np.stack([turn, theta_v, _from_zero(phi_l + turn), theta_l], axis=-1)
+        turn = _from_zero(-np.asarray(phi_v, np.float64))
+        return np.stack([turn, theta_v, _from_zero(np.asarray(phi_l, np.float64) + turn), theta_l], axis=-1)
 
     def pixels(self, places: Mapping[str, float], points: Floats) -> Floats:
         """(n, 2) columns and rows where (n, 3) points of the sample's frame are seen, nominal."""

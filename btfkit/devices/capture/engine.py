@@ -357,12 +357,13 @@ class Engine:
     ) -> None:
         if not image.size:
             return
+        window = self._window(step)
         drift = compared(
             np.asarray(self._store.image(first["file"])),
             image,
             black=float(self._rig.description["sensor"]["black"]),
             scale=lamp * exposure_s / (first["lamp"] * first["exposure_s"]),
-            window=self._window(step) if step.meter == WHITE else np.ones(image.shape[:2], bool),
+            window=np.ones(self._shape(), bool) if window is None else window,
         )
         self._drift = drift
         self._store.note(

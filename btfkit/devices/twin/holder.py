@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.devices.twin import layout
-from btfkit.devices.twin.geometry import Floats, Truth
+from btfkit.devices.poses import Floats
+from btfkit.devices.twin.geometry import Truth
 
 Image = NDArray[np.float32]
 # Reflectance of ink, paper, mount and of what lies beyond the plate.
@@ -50,8 +51,8 @@ class Plate:
     def texels(self, points: Image) -> Image:
         """(..., 2) columns and rows of the drawing for x and y in mm."""
         h, w = self.drawing.shape[:2]
-        scale = np.float32([self._scale, -self._scale])
-        return points * scale + np.float32([w / 2 - 0.5, h / 2 - 0.5])
+        scale = np.array([self._scale, -self._scale], np.float32)
+        return points * scale + np.array([w / 2 - 0.5, h / 2 - 0.5], np.float32)
 
     def at(self, points: Image) -> Image:
         """(h, w, 4) of the drawing at (h, w, 2) x and y in mm, between texels bilinear."""
@@ -90,7 +91,7 @@ class Plate:
         rows, down = _covered(h, h / 2 - y[1] * self._scale, h / 2 - y[0] * self._scale)
         share = (down[:, None] * across)[..., None]
         part = self.drawing[rows, cols]
-        part += share * (np.float32([*reflectance, white]) - part)
+        part += share * (np.array([*reflectance, white], np.float32) - part)
 
 
 def board_cells() -> list[tuple[float, float, float, bool]]:
@@ -105,7 +106,7 @@ def board_cells() -> list[tuple[float, float, float, bool]]:
     across, down = layout.BOARD
     modules = dictionary.markerSize + 2
     marked = {}
-    for number, corners in zip(board.getIds().ravel(), board.getObjPoints(), strict=True):
+    for number, corners in zip(np.asarray(board.getIds()).ravel(), board.getObjPoints(), strict=True):
         left, top = (float(c) for c in np.asarray(corners)[0, :2])
         marked[int(left / layout.SQUARE_MM), int(top / layout.SQUARE_MM)] = (number, left, top)
     cells: list[tuple[float, float, float, bool]] = []

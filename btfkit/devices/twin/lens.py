@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.devices.twin.geometry import Floats, Placed, Truth
+from btfkit.devices.poses import Floats
+from btfkit.devices.twin.geometry import Placed, Truth
 from btfkit.devices.twin.imperfections import Imperfections
 
 Image = NDArray[np.float32]
@@ -61,7 +62,7 @@ class Lens:
             return image
         scale = self.size[1] / 640
         sigma = scale * np.hypot(_BLUR_PX, _OUT_OF_FOCUS * (depth_mm - focus_mm)).astype(np.float32)
-        levels = scale * np.float32([_BLUR_PX, 1.0, 1.6, 2.4])
+        levels = scale * np.array([_BLUR_PX, 1.0, 1.6, 2.4], np.float32)
         stack = [cv2.GaussianBlur(image, (0, 0), float(level)) for level in levels]
         out = stack[0]
         # Between two levels the variance, not the deviation, mixes linearly.

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.devices.twin import layout
-from btfkit.devices.twin.geometry import Floats, Placed, Truth
+from btfkit.devices.poses import Floats
+from btfkit.devices.twin.geometry import Placed, Truth
 from btfkit.devices.twin.holder import Plate
 from btfkit.devices.twin.imperfections import Imperfections
 from btfkit.devices.twin.lens import Lens
@@ -130,13 +131,13 @@ class Scene:
         where = (at + step[:, None] * to)[:, :2]
         # Lines of a kilo-ray: OpenCV's images end at 32767 columns.
         lines = np.resize(where, (-(-len(where) // 1024), 1024, 2))
-        seen = self._on_plate(lines, shading).reshape(-1, 3)[: len(where)]
+        seen = self._on_plate(lines.astype(np.float32), shading).reshape(-1, 3)[: len(where)]
         return np.where(down[:, None], 0.9 * seen, 0).astype(np.float32)
 
     def _add_sample(self, fine: Image, where: Image, placed: Placed) -> None:
         """Trace the rays that meet the sample."""
-        half = np.float32([self._size_mm[0] / 2, self._size_mm[1] / 2])
-        inside = (np.abs(where) < half).all(-1)
+        half = np.array([self._size_mm[0] / 2, self._size_mm[1] / 2], np.float32)
+        inside = np.asarray((np.abs(where) < half).all(-1))
         if not inside.any():
             return
         xy = where[inside]
@@ -148,7 +149,7 @@ class Scene:
         light = to_lamp / np.sqrt(distance2)[:, None]
         view = to_camera / np.linalg.norm(to_camera, axis=-1, keepdims=True)
         h, w = self._relief.height.shape
-        place = (xy / (2 * half) * np.float32([1, -1]) + np.float32(0.5)) * np.float32([w, h])
+        place = (xy / (2 * half) * np.array([1, -1], np.float32) + np.float32(0.5)) * np.array([w, h], np.float32)
         traced = kernel.trace(
             self._relief, place - np.float32(0.5), light, view,
             np.zeros(len(xy), np.float32), samples=1,

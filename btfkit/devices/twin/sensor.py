@@ -51,7 +51,7 @@ class Sensor:
     def filtered(self, image: Image) -> Image:
         """Linear sRGB (h, w, 3) as each pixel's filter passes it: (h, w), or (h, w, 3)."""
         if "colour" in self._imperfections:
-            image = image @ np.float32(_FILTERS).T
+            image = image @ np.array(_FILTERS, np.float32).T
         if not self._mosaic:
             return image
         out = np.empty(self.size, np.float32)

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from btfkit.devices.twin import layout
-from btfkit.devices.twin.geometry import Floats, Placed
+from btfkit.devices.poses import Floats
+from btfkit.devices.twin.geometry import Placed
 from btfkit.devices.twin.lens import Lens
 
 Image = NDArray[np.float32]

@@ -69,14 +69,13 @@ class Hello(NamedTuple):
     boot: int
     description: int
 
-    FORMAT = struct.Struct("<HBxII")
-
     def packed(self) -> bytes:
-        return self.FORMAT.pack(*self)
+        return _HELLO.pack(*self)
 
-    @classmethod
-    def parsed(cls, payload: bytes) -> Hello:
-        return cls(*cls.FORMAT.unpack(payload))
+    @staticmethod
+    def parsed(payload: bytes) -> Hello:
+        protocol, axes, boot, description = _HELLO.unpack(payload)
+        return Hello(protocol, axes, boot, description)
 
 
 class Status(NamedTuple):
@@ -96,8 +95,9 @@ class Status(NamedTuple):
 
     @staticmethod
     def parsed(payload: bytes) -> Status:
-        state, source, *numbers = _STATUS.unpack_from(payload)
-        return Status(State(state), source, *numbers, *_two_places(payload, _STATUS.size))
+        state, source, clock_s, lamp, temperature_c = _STATUS.unpack_from(payload)
+        encoder, counter = _two_places(payload, _STATUS.size)
+        return Status(State(state), source, clock_s, lamp, temperature_c, encoder, counter)
 
 
 class Exposed(NamedTuple):
@@ -124,9 +124,11 @@ class Exposed(NamedTuple):
     @staticmethod
     def parsed(payload: bytes) -> Exposed:
         numbers = _EXPOSED.unpack_from(payload)
-        return Exposed(*numbers, *_two_places(payload, _EXPOSED.size))
+        places = _two_places(payload, _EXPOSED.size)
+        return Exposed._make((*numbers, *places))
 
 
+_HELLO = struct.Struct("<HBxII")
 _STATUS = struct.Struct("<IIddd")
 _EXPOSED = struct.Struct("<IIHHHxxIIddddd")
 # What stands before the counts in a frame buffer: the numbers of the exposure that filled it.
