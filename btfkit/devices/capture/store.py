@@ -172,8 +172,7 @@ def begin(path: Path, document: Mapping[str, Any], *, resume: bool, storage: flo
                 f"{path} was begun with another plan", remedy=f"--plan {path / PLAN}"
             )
         return
-    if path.exists() and any(path.iterdir()):
-        raise FileExistsError(f"{path} exists; --resume goes on with it")
+    refuse_begun(path)
     path.mkdir(parents=True, exist_ok=True)
     free = shutil.disk_usage(path).free
     if storage > free:
@@ -182,6 +181,16 @@ def begin(path: Path, document: Mapping[str, Any], *, resume: bool, storage: flo
             remedy="free some space, or measure fewer pairs",
         )
     documents.save(path / PLAN, document)
+
+
+def refuse_begun(path: Path) -> None:
+    """Refuse a folder in which something is.
+
+    Raises:
+        FileExistsError: it is not empty.
+    """
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise FileExistsError(f"{path} exists; --resume goes on with the run in it")
 
 
 def finished_groups(records: Sequence[Record]) -> dict[int, list[Record]]:
