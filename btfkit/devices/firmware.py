@@ -50,7 +50,7 @@ class Firmware:
 
     Args:
         world: what it drives. faults: what goes wrong on its side of the wire.
-        log: told what really was at each exposure.
+        log: told what really was at each exposure, and when axes are homed.
     """
 
     def __init__(self, world: World, faults: Faults, log: Log | None = None) -> None:
@@ -177,6 +177,8 @@ class Firmware:
     def _home(self, _: bytes) -> bytes:
         self._refuse_busy()
         self._state &= ~(State.STOPPED | State.LIMIT)
+        if self._log is not None:
+            self._log({"homed": self._boot, "time_s": self.world.clock.now()})
         for motor in self.world.motors:
             motor.home(self.world.clock.now())
         self._motion = Event.HOMED

@@ -187,9 +187,9 @@ class UsbStage(Stage):
             for name, target in targets.items()
             if target < now[name] - self.axes[name].resolution
         }
+        self._go({**targets, **below})
         if below:
-            self._go(below)
-        self._go(targets)
+            self._go({name: targets[name] for name in below})
         status = self._status()
         for name, target in targets.items():
             index = self._names.index(name)

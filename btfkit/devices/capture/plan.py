@@ -125,12 +125,17 @@ def from_document(path: str, document: Mapping[str, Any]) -> Plan:
         raise FormatError(path, f"version {document['version']!r}; expected {VERSION}")
     views = _directions(path, "views", document.get("views", 12))
     lights = _directions(path, "lights", document.get("lights", 12))
+    bracket = _bracket(path, fields.section("exposures"))
+    named = document.get("pairs")
+    frames = bracket.count * (len(named) if isinstance(named, list) else len(views) * len(lights))
+    if frames > _MOST_FRAMES:
+        raise FormatError(path, f"{frames} frames of the sample; at most {_MOST_FRAMES}")
     plan = Plan(
         name=str(document.get("name", Path(path).stem)),
         views=views,
         lights=lights,
         pairs=_pairs(path, document.get("pairs"), len(views), len(lights)),
-        bracket=_bracket(path, fields.section("exposures")),
+        bracket=bracket,
         darks=_ramp(path, "darks", fields.section("darks"), Plan.__dataclass_fields__["darks"]),
         flats=_ramp(path, "flats", fields.section("flats"), Plan.__dataclass_fields__["flats"]),
         whites=fields.whole("whites", Plan.whites),
@@ -146,9 +151,6 @@ def from_document(path: str, document: Mapping[str, Any]) -> Plan:
         document=dict(document),
     )
     fields.refuse_others(_KEYS)
-    frames = len(plan) * plan.bracket.count
-    if frames > _MOST_FRAMES:
-        raise FormatError(path, f"{frames} frames of the sample; at most {_MOST_FRAMES}")
     return plan
 
 

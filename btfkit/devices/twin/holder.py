@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import cv2
@@ -38,10 +39,7 @@ class Plate:
             across * layout.SQUARE_MM + margin, down * layout.SQUARE_MM + margin
         )  # fmt: skip
         self._scale = texels_per_mm
-        w, h = (round(side * texels_per_mm) for side in self.size_mm)
-        self.drawing = np.zeros((h, w, 4), np.float32)
-        self.drawing[..., :3] = _CLOTH
-        self._board()
+        self.drawing = _board_drawing(self.size_mm, texels_per_mm).copy()
         half = layout.MOUNT_MM / 2
         self._fill((-half, half), (-half, half), (_MOUNT,) * 3)
         for patch, shift in zip(target["patches"], truth.displaced, strict=False):
@@ -68,30 +66,48 @@ class Plate:
         (x, y), (w, h) = np.asarray(entry["centre_mm"][:2]) + shift, entry["size_mm"]
         self._fill((x - w / 2, x + w / 2), (y - h / 2, y + h / 2), entry["reflectance"], white)
 
-    def _board(self) -> None:
-        across, down = layout.BOARD
-        left, top = -across * layout.SQUARE_MM / 2, down * layout.SQUARE_MM / 2
-        self._fill((left, -left), (-top, top), (_PAPER,) * 3)
-        for x, y, side, ink in board_cells():
-            self._fill(
-                (left + x, left + x + side), (top - y - side, top - y),
-                (_INK if ink else _PAPER,) * 3,
-            )  # fmt: skip
-
     def _fill(
         self,
         x: tuple[float, float],
         y: tuple[float, float],
-        reflectance: tuple[float, ...] | list[float],
+        reflectance: Sequence[float],
         white: float = 0.0,
     ) -> None:
-        """Paint a rectangle; texels on its border get their share."""
-        h, w = self.drawing.shape[:2]
-        cols, across = _covered(w, x[0] * self._scale + w / 2, x[1] * self._scale + w / 2)
-        rows, down = _covered(h, h / 2 - y[1] * self._scale, h / 2 - y[0] * self._scale)
-        share = (down[:, None] * across)[..., None]
-        part = self.drawing[rows, cols]
-        part += share * (np.array([*reflectance, white], np.float32) - part)
+        _fill(self.drawing, self._scale, x, y, (*reflectance, white))
+
+
+@functools.lru_cache(maxsize=4)
+def _board_drawing(size_mm: tuple[float, float], texels_per_mm: float) -> Image:
+    """(H, W, 4) of cloth and board: thousands of modules, the same for every twin."""
+    w, h = (round(side * texels_per_mm) for side in size_mm)
+    drawing = np.zeros((h, w, 4), np.float32)
+    drawing[..., :3] = _CLOTH
+    across, down = layout.BOARD
+    left, top = -across * layout.SQUARE_MM / 2, down * layout.SQUARE_MM / 2
+    _fill(drawing, texels_per_mm, (left, -left), (-top, top), (_PAPER, _PAPER, _PAPER, 0.0))
+    for x, y, side, ink in board_cells():
+        level = _INK if ink else _PAPER
+        _fill(
+            drawing, texels_per_mm, (left + x, left + x + side), (top - y - side, top - y),
+            (level, level, level, 0.0),
+        )  # fmt: skip
+    return drawing
+
+
+def _fill(
+    drawing: Image,
+    scale: float,
+    x: tuple[float, float],
+    y: tuple[float, float],
+    value: Sequence[float],
+) -> None:
+    """Paint a rectangle; texels on its border get their share."""
+    h, w = drawing.shape[:2]
+    cols, across = _covered(w, x[0] * scale + w / 2, x[1] * scale + w / 2)
+    rows, down = _covered(h, h / 2 - y[1] * scale, h / 2 - y[0] * scale)
+    share = (down[:, None] * across)[..., None]
+    part = drawing[rows, cols]
+    part += share * (np.asarray(value, np.float32) - part)
 
 
 def board_cells() -> list[tuple[float, float, float, bool]]:

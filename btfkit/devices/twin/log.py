@@ -47,8 +47,8 @@ class Twin:
     def __post_init__(self) -> None:
         Imperfections.without(self.without)
         for name, side in (("width", self.width), ("height", self.height)):
-            if not 64 <= side <= 8192 or side % 2:
-                raise ValueError(f"{name} {side}; expected an even number of pixels, 64 to 8192")
+            if not 32 <= side <= 8192 or side % 2:
+                raise ValueError(f"{name} {side}; expected an even number of pixels, 32 to 8192")
 
     def relief(self) -> Relief:
         """The sample.
@@ -92,7 +92,9 @@ class TwinLog:
         self._path = folder / NAME
         lines = _lines(self._path)
         if twin is None and not lines:
-            raise FileNotFoundError(f"{self._path} is not there: the run was not made by the twin")
+            raise FileNotFoundError(
+                f"{self._path} is not there: the twin has exposed nothing here; begin a new run"
+            )
         first = _twin(self._path, lines[0]) if lines else None
         if first is not None and twin is not None and first != twin:
             raise DeviceError(
@@ -110,7 +112,7 @@ class TwinLog:
     def begin(self) -> Setup:
         """The world of a new session: the same rig, some time later.
 
-        The log itself begins with the first exposure, so that a refused run leaves nothing.
+        The log itself begins when the axes are homed, so that a refused run leaves nothing.
         """
         start = 0.0 if self._last_s is None else self._last_s + _PAUSE_S
         self._pending = [{"session": self._sessions}]
@@ -119,7 +121,7 @@ class TwinLog:
         return self.twin.setup(session=self._sessions, start_s=start)
 
     def __call__(self, entry: Mapping[str, Any]) -> None:
-        """Keep what really was at one exposure."""
+        """Keep what the firmware tells: what really was at an exposure."""
         lines = [json.dumps(each, allow_nan=False) for each in (*self._pending, entry)]
         self._pending = []
         with self._path.open("a", encoding="utf-8") as file:

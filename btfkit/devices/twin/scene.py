@@ -22,8 +22,8 @@ from btfkit.relief.trace import geometry
 Image = NDArray[np.float32]
 # Rays a side of a pixel, by default.
 GRID = 2
-# Shading of the plate is smooth: it is worked out so many times a mm, and read between.
-_SHADING_PER_MM = 2.0
+# Shading of the plate is smooth: it is worked out every fourth pixel or so, and read between.
+_SHADING = 2.0 / 640
 _DARKEST_COSINE = 1e-3
 
 
@@ -58,6 +58,7 @@ class Scene:
         self._spheres = Spheres(truth.spheres)
         self._lamp_mm = imperfections.of("lamp-size", layout.LAMP_RADIUS_MM)
         self._white = layout.WHITE_ANGULAR
+        self._per_mm = _SHADING * size[1]
 
     def image(self, placed: Placed) -> Image:
         """(h, w, 3) linear sRGB, pi x radiance for irradiance 1 at the origin, through the lens."""
@@ -95,9 +96,9 @@ class Scene:
         """(h, w, 2) over the plate: pi x radiance of a white Lambertian surface, and of the white
         reference of reflectance 1."""
         width, height = self._plate.size_mm
-        w, h = round(width * _SHADING_PER_MM), round(height * _SHADING_PER_MM)
-        x = (np.arange(w) + 0.5) / _SHADING_PER_MM - width / 2
-        y = height / 2 - (np.arange(h) + 0.5) / _SHADING_PER_MM
+        w, h = round(width * self._per_mm), round(height * self._per_mm)
+        x = (np.arange(w) + 0.5) / self._per_mm - width / 2
+        y = height / 2 - (np.arange(h) + 0.5) / self._per_mm
         points = np.stack([*np.meshgrid(x, y), np.zeros((h, w))], axis=-1)
         points = self._truth.board.of(points).astype(np.float32)
         up = self._truth.board.turn[:, 2].astype(np.float32)
@@ -116,8 +117,8 @@ class Scene:
     def _on_plate(self, where: Image, shading: Image) -> Image:
         """(H, W, 3) pi x radiance of the plate at (H, W, 2) x and y."""
         width, height = self._plate.size_mm
-        col = (where[..., 0] + np.float32(width / 2)) * np.float32(_SHADING_PER_MM) - np.float32(0.5)
-        row = (np.float32(height / 2) - where[..., 1]) * np.float32(_SHADING_PER_MM) - np.float32(0.5)
+        col = (where[..., 0] + np.float32(width / 2)) * np.float32(self._per_mm) - np.float32(0.5)
+        row = (np.float32(height / 2) - where[..., 1]) * np.float32(self._per_mm) - np.float32(0.5)
         lit = cv2.remap(shading, col, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         drawn = self._plate.at(where)
         light = lit[..., 0] + drawn[..., 3] * (lit[..., 1] - lit[..., 0])

@@ -17,7 +17,7 @@ Image = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 _MIRROR = 0.9
 # The highlight of a point is as wide as the aperture makes it, px of a 640 pixel wide sensor.
-_SPOT_PX = 0.35
+_SPOT_PX = 0.5
 
 
 @final
