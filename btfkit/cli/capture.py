@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,6 +63,8 @@ def capture_verb(
 
     A run that ends early, for whatever reason, goes on with --resume.
     """
+    from btfkit.devices import DRIVERS
+
     driver, _, where = device.partition(":")
     given = {
         "--fault": faults, "--truth": truth, "--perfect": perfect, "--without": without,
@@ -69,8 +73,8 @@ def capture_verb(
     wrong = [name for name in _TWIN if given[name]]
     if driver != "mock" and wrong:
         raise click.UsageError(f"{wrong[0]} is for --device mock")
-    if driver not in ("mock", "usb"):
-        raise click.UsageError(f"--device {device}: expected mock or usb")
+    if driver not in DRIVERS:
+        raise click.UsageError(f"--device {device}: expected {' or '.join(DRIVERS)}")
     if perfect and without:
         raise click.UsageError("--perfect leaves nothing for --without")
     from btfkit.devices.capture import plan as plans
@@ -116,12 +120,13 @@ def _twin(
 
 
 def _rehearsed(plan: Plan, driver: str, twin: Twin | None, where: str) -> Outcome:
-    from btfkit.devices import mock, usb
+    from btfkit import devices
+    from btfkit.devices import mock
     from btfkit.devices.capture.steps import estimate, steps_of
     from btfkit.devices.twin.log import Twin
 
-    if driver == "usb":
-        rig = usb.open_rig(where or None)
+    if driver != "mock":
+        rig = devices.driver(driver).open_rig(where or None)
     else:
         rig = mock.open_rig((twin or Twin()).setup(blind=True))
     with rig:
@@ -157,7 +162,9 @@ def _measured(
     truth: Path | None,
     force: bool,
 ) -> Outcome:
-    from btfkit.devices import mock, usb
+    from btfkit import devices
+    from btfkit.cli.live import Live
+    from btfkit.devices import mock
     from btfkit.devices.capture.engine import Progress
     from btfkit.devices.capture.live import Page
     from btfkit.devices.capture.run import measure
@@ -171,23 +178,25 @@ def _measured(
     striking = Faults(faults, seed=(twin.seed if twin else 0))
     if not resume:
         refuse_begun(out)
-    if driver == "usb":
-        rig = usb.open_rig(where or None)
+    if driver != "mock":
+        rig = devices.driver(driver).open_rig(where or None)
     else:
         log = TwinLog(out, twin)
         rig = mock.open_rig(log.begin(), faults=striking, log=log)
-    page: Page | None = None
+    shown: list[Callable[[Progress], None]] = []
 
     def observe(progress: Progress) -> None:
-        nonlocal page
-        bar(progress.done, progress.total)
-        if watch:
-            sensor = rig.camera.sensor
-            page = page or Page(out, black=sensor["black"], white=sensor["white"])
-            page(progress)
+        if not shown:
+            levels = {name: rig.camera.sensor[name] for name in ("black", "white")}
+            shown.extend([Page(out, **levels)] if watch else [])
+            shown.extend([] if bar.silent else [screen.enter_context(Live(**levels))])
+            shown.append(lambda _: None)
+        for show in shown:
+            show(progress)
 
-    report = measure(rig, plan, out, resume=resume, faults=striking, observer=observe,
-                     synthetic=driver == "mock")  # fmt: skip
+    with ExitStack() as screen:
+        report = measure(rig, plan, out, resume=resume, faults=striking, observer=observe,
+                         synthetic=driver == "mock")  # fmt: skip
     data: dict[str, Any] = {"out": out, **report.__dict__, "faults": dict(striking.struck)}
     line = (
         f"{out}: {report.frames} frames of {report.groups} poses, {report.taken} taken now, "

@@ -27,6 +27,16 @@ from btfkit.errors import DeviceError
 _SLACK_S = 10.0
 
 
+@final
+@dataclass(frozen=True)
+class Found:
+    """A rig that could be opened: its serial number, what it calls itself, the driver's handle."""
+
+    serial: str
+    name: str
+    device: Any = None
+
+
 class PositionError(DeviceError):
     """An axis is not where it should be; homing may help."""
 

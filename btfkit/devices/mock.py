@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from btfkit.devices import usb
-from btfkit.devices.base import Rig
+from btfkit.devices.base import Found, Rig
 from btfkit.devices.faults import Faults
 from btfkit.devices.firmware import Firmware, Log
 from btfkit.devices.twin.world import Setup, World
@@ -13,6 +13,11 @@ from btfkit.devices.virtual import VirtualBus
 def serial(setup: Setup) -> str:
     """The twin's serial number: of what is drawn for it."""
     return f"TWIN{setup.seed}"
+
+
+def find() -> list[Found]:
+    """The twin, which is always there; it is named by its sensor."""
+    return [Found(f"{Setup.width}x{Setup.height}", "btfkit twin")]
 
 
 def open_rig(

@@ -6,25 +6,21 @@ process; a recording of either can stand in for both.
 
 from __future__ import annotations
 
-import errno
-import functools
-import importlib
 import json
 import struct
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, TypeVar, final
 
 import numpy as np
 import usb.core
-import usb.util
 
 from btfkit.devices.base import (
     Axis,
     Camera,
     CameraLimits,
     Exposure,
+    Found,
     FrameLostError,
     Light,
     PositionError,
@@ -32,37 +28,25 @@ from btfkit.devices.base import (
     Stage,
     UnpluggedError,
 )
+from btfkit.devices.bulk import Bulk, libusb
 from btfkit.devices.clock import Clock, WallClock
 from btfkit.devices.deadline import Watchdog
 from btfkit.devices.wire import messages
-from btfkit.devices.wire.link import Link, Refused, Transport
+from btfkit.devices.wire.link import Link, Refused
 from btfkit.devices.wire.messages import Command, Event, Exposed, Hello, Refusal, State, Status
-from btfkit.devices.wire.packets import MOST_PAYLOAD, OVERHEAD, Packet
+from btfkit.devices.wire.packets import Packet
 from btfkit.errors import DeviceError
 
 T = TypeVar("T")
 
 # pid.codes' number for tests: firmware for a product takes one of its own.
 VENDOR, PRODUCT = 0x1209, 0x0001
-ENDPOINT_OUT, ENDPOINT_IN = 0x01, 0x81
-# A whole reply, in packets of 512 bytes.
-_READ_BYTES = -(-(MOST_PAYLOAD + OVERHEAD) // 512) * 512
-_WRITE_MS = 1000
+_NO_LIBUSB = 'libusb is missing: pip install "btfkit[usb]"'
 # An axis that rests further from its target than this is not where the frame would say it is.
 _OFF_RAD, _OFF_MM = 4e-4, 0.02
 # Approach every target from below by so much, and backlash is always taken up on the same side.
 APPROACH_RAD, APPROACH_MM = 5e-3, 0.2
 _MOST_DESCRIPTION = 1 << 20
-
-
-@final
-@dataclass(frozen=True)
-class Found:
-    """A rig on the bus: its serial number, and what it calls itself."""
-
-    serial: str
-    name: str
-    device: Any
 
 
 def find(backend: Any = None) -> list[Found]:
@@ -74,7 +58,7 @@ def find(backend: Any = None) -> list[Found]:
     try:
         devices = list(
             usb.core.find(
-                find_all=True, idVendor=VENDOR, idProduct=PRODUCT, backend=backend or _libusb()
+                find_all=True, idVendor=VENDOR, idProduct=PRODUCT, backend=backend or libusb()
             )
         )
     except usb.core.NoBackendError:
@@ -98,7 +82,7 @@ def open_rig(serial: str | None = None, *, backend: Any = None, clock: Clock | N
     """
     rigs = find(backend)
     if not rigs:
-        remedy = "plug it in and switch it on" if backend or _libusb() else _NO_LIBUSB
+        remedy = "plug it in and switch it on" if backend or libusb() else _NO_LIBUSB
         raise DeviceError("no rig on the USB bus", remedy=remedy)
     listing = ", ".join(rig.serial for rig in rigs)
     chosen = [rig for rig in rigs if serial in (None, rig.serial)]
@@ -114,7 +98,7 @@ class UsbRig(Rig):
 
     def __init__(self, found: Found, clock: Clock) -> None:
         super().__init__(found.serial, Watchdog(f"rig {found.serial}"))
-        self._transport = _Bulk(found.device, clock)
+        self._transport = Bulk(found.device, clock)
         self._clock = clock
         self.link = Link(self._transport)
 
@@ -315,82 +299,6 @@ class UsbLight(Light):
 
     def _reading(self) -> float:
         return _parsed(Status.parsed, self._link.request(Command.STATUS)).lamp
-
-
-@final
-class _Bulk(Transport):
-    """Two bulk endpoints through pyusb."""
-
-    def __init__(self, device: Any, clock: Clock) -> None:
-        self._device = device
-        self._clock = clock
-
-    def claim(self) -> None:
-        """Take the interface, and drop what an earlier owner left unread."""
-        self._tried(self._device.set_configuration)
-        self._tried(lambda: usb.util.claim_interface(self._device, 0))
-        self.recover()
-
-    def release(self) -> None:
-        usb.util.dispose_resources(self._device)
-
-    def write(self, data: bytes) -> None:
-        sent = self._tried(lambda: self._device.write(ENDPOINT_OUT, data, _WRITE_MS))
-        if sent is not None and sent != len(data):
-            raise DeviceError(f"{sent} of {len(data)} bytes were sent to the rig")
-
-    def read(self, timeout_s: float) -> bytes:
-        # libusb takes 0 for ever.
-        timeout = max(1, round(timeout_s * 1000))
-        found = self._tried(lambda: self._device.read(ENDPOINT_IN, _READ_BYTES, timeout))
-        return b"" if found is None else bytes(found)
-
-    def recover(self) -> None:
-        for endpoint in (ENDPOINT_OUT, ENDPOINT_IN):
-            self._tried(functools.partial(self._device.clear_halt, endpoint))
-        for _ in range(16):
-            if not self.read(0.001):
-                break
-
-    def now(self) -> float:
-        return self._clock.now()
-
-    def _tried(self, call: Callable[[], T]) -> T | None:
-        """What `call` returns; None after a time-out or a halt, which is cleared."""
-        try:
-            return call()
-        except usb.core.USBTimeoutError:
-            return None
-        except usb.core.USBError as error:
-            if error.errno == errno.EPIPE:
-                self._device.clear_halt(ENDPOINT_IN)
-                self._device.clear_halt(ENDPOINT_OUT)
-                return None
-            if error.errno in (errno.ENODEV, errno.EIO, errno.ENOENT):
-                raise UnpluggedError(
-                    f"the rig is gone from the bus ({error.strerror})",
-                    remedy="plug it in again, then start again with --resume",
-                ) from error
-            if error.errno == errno.EACCES:
-                raise DeviceError("this user may not open the rig", remedy=_UDEV) from error
-            if error.errno == errno.EBUSY:
-                raise DeviceError("another program has claimed the rig") from error
-            raise DeviceError(f"USB: {error}") from error
-
-
-_UDEV = "install the udev rule of docs/capture.md"
-_NO_LIBUSB = 'libusb is missing: pip install "btfkit[usb]"'
-
-
-def _libusb() -> Any:
-    """libusb as a wheel brings it, or the system's; None where there is neither."""
-    import usb.backend.libusb1
-
-    try:
-        package = importlib.import_module("libusb_package")
-    except ImportError:
-        return usb.backend.libusb1.get_backend()
-    return package.get_libusb1_backend()
 
 
 def _parsed(parse: Callable[[bytes], T], payload: bytes) -> T:

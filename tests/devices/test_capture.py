@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import shutil
@@ -85,11 +86,11 @@ def test_axes_point_camera_and_lamp_where_the_plan_says():
     theta, phi = rng.uniform(0, 1.3, (2, 50)), rng.uniform(0, 2 * math.pi, (2, 50))
     view, light = (directions.from_angles(t, p) for t, p in zip(theta, phi, strict=True))
     world = World(Twin(without=everything()).setup(blind=True))
-    for row, v, l in zip(Aim(DESCRIPTION).axes(view, light), view, light, strict=True):
+    for row, to_view, to_light in zip(Aim(DESCRIPTION).axes(view, light), view, light, strict=True):
         names = [axis.name for axis in AXES]
         place = world.truth.placed(dict(zip(names, row, strict=True)))
-        np.testing.assert_allclose(place.camera / np.linalg.norm(place.camera), v, atol=1e-12)
-        np.testing.assert_allclose(place.lamp / np.linalg.norm(place.lamp), l, atol=1e-12)
+        np.testing.assert_allclose(place.camera / np.linalg.norm(place.camera), to_view, atol=1e-12)
+        np.testing.assert_allclose(place.lamp / np.linalg.norm(place.lamp), to_light, atol=1e-12)
 
 
 def test_a_rig_with_other_axes_is_refused_with_a_way_out():
@@ -175,11 +176,12 @@ def test_metering_fills_the_range_without_saturating(exponent, guess):
     times = metered(look, 10**guess, Bracket(4, 4.0, 2.0), sensor=sensor, window=None)
     assert len(looks) <= 6
     assert list(times) == sorted(set(times))
-    assert 2e-5 <= times[0] and times[-1] <= 2.0
+    assert times[0] >= 2e-5
+    assert times[-1] <= 2.0
     # 0.7 of the range, less up to a third of a stop; counts of a dark look are whole.
-    if 2e-5 < times[0] and times[0] < 2.0:
+    if times[0] not in (2e-5, 2.0):
         assert 0.7 / 2 ** (1 / 3) * 0.95 <= radiance * times[0] <= 0.7 * 1.05
-    for short, long in zip(times, times[1:], strict=False):
+    for short, long in itertools.pairwise(times):
         assert long == pytest.approx(4 * short) or long == 2.0
 
 

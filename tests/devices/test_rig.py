@@ -12,7 +12,7 @@ import usb.core
 
 from btfkit.devices import DRIVERS, driver, mock
 from btfkit.devices import usb as usb_driver
-from btfkit.devices.base import PositionError, UnpluggedError
+from btfkit.devices.base import Found, PositionError, UnpluggedError
 from btfkit.devices.deadline import Watchdog
 from btfkit.devices.faults import Faults
 from btfkit.devices.firmware import Firmware
@@ -40,8 +40,10 @@ def a_bus(peripheral, *, serial: str = "S1") -> VirtualBus:
 
 
 @pytest.mark.parametrize("name", DRIVERS)
-def test_every_driver_opens_rigs(name):
-    assert callable(driver(name).open_rig)
+def test_every_driver_finds_and_opens_rigs(name):
+    module = driver(name)
+    assert callable(module.open_rig)
+    assert all(isinstance(each, Found) for each in module.find())
 
 
 def test_no_other_driver_is_known():
@@ -84,7 +86,7 @@ def test_the_firmware_refuses_what_a_driver_should_not_have_sent():
         with pytest.raises(Refused, match="refused move: positions are not known"):
             rig.link.request(Command.MOVE, messages.move({0: 0.1}))
         rig.stage.home()
-        with pytest.raises(Refused, match="axis 0 to 99 .*out_of_range"):
+        with pytest.raises(Refused, match=r"axis 0 to 99 .*out_of_range"):
             rig.link.request(Command.MOVE, messages.move({0: 99.0}))
         with pytest.raises(Refused, match="malformed"):
             rig.link.request(Command.MOVE, b"abc")
@@ -93,7 +95,10 @@ def test_the_firmware_refuses_what_a_driver_should_not_have_sent():
 
 
 def test_positions_are_unknown_until_homed():
-    with a_rig() as rig, pytest.raises(PositionError, match="does not know its positions; home it"):
+    with (
+        a_rig() as rig,
+        pytest.raises(PositionError, match=r"does not know its positions; home it"),
+    ):
         rig.stage.position()
 
 
@@ -124,10 +129,15 @@ def test_a_rig_has_one_owner_at_a_time():
 def test_leaving_a_rig_darkens_it_also_after_an_error():
     world = World(SMALL.setup())
     rig = usb_driver.open_rig(backend=a_bus(Firmware(world, Faults())), clock=world.clock)
-    with pytest.raises(ZeroDivisionError), rig:
-        rig.light.switch("lamp")
-        assert rig.light.reading() > 0.9
-        raise ZeroDivisionError
+
+    def fail():
+        with rig:
+            rig.light.switch("lamp")
+            assert rig.light.reading() > 0.9
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
     assert world.lamp.source == 0
 
 
@@ -301,9 +311,14 @@ def test_another_byte_than_the_recorded_one_is_refused():
         rig.stage.home()
         rig.stage.move_to(turntable=0.2)
     rig = usb_driver.open_rig(backend=a_bus(Replay(recorder.lines)), clock=TwinClock())
-    with pytest.raises(DeviceError, match="line .* of the recording: .* was sent; expected >"), rig:
-        rig.stage.home()
-        rig.stage.move_to(turntable=0.3)
+
+    def differ():
+        with rig:
+            rig.stage.home()
+            rig.stage.move_to(turntable=0.3)
+
+    with pytest.raises(DeviceError, match=r"line .* of the recording: .* was sent; expected >"):
+        differ()
     with pytest.raises(FormatError, match="line 2 is '> xy'"):
         Replay(["> 00", "> xy"])
     with pytest.raises(DeviceError, match="the recording is over; a read came after it"):
