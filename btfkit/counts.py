@@ -95,7 +95,9 @@ def _read_floats(name: str, data: bytes) -> Counts:
         file.flush()
         source = oiio.ImageInput.open(file.name)
         pixels = None if source is None else source.read_image(oiio.FLOAT)
-        if source is None or pixels is None or source.geterror():
+        # Asked for, or the library prints it at exit.
+        fault = oiio.geterror() if source is None else source.geterror()
+        if source is None or pixels is None or fault:
             raise FormatError(name, f"not a readable {suffix} image", remedy="copy it again")
         values = np.asarray(pixels, np.float32)
         source.close()

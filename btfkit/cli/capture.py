@@ -165,8 +165,8 @@ def _measured(
     from btfkit import devices
     from btfkit.cli.live import Live
     from btfkit.devices import mock
-    from btfkit.devices.capture.engine import Progress
     from btfkit.devices.capture.live import Page
+    from btfkit.devices.capture.progress import Progress
     from btfkit.devices.capture.run import measure
     from btfkit.devices.capture.store import refuse_begun
     from btfkit.devices.faults import Faults
@@ -183,14 +183,15 @@ def _measured(
     else:
         log = TwinLog(out, twin)
         rig = mock.open_rig(log.begin(), faults=striking, log=log)
-    shown: list[Callable[[Progress], None]] = []
+    shown: list[Callable[[Progress], None]] | None = None
 
     def observe(progress: Progress) -> None:
-        if not shown:
+        nonlocal shown
+        if shown is None:
+            # The sensor's levels are known once the rig is open.
             levels = {name: rig.camera.sensor[name] for name in ("black", "white")}
-            shown.extend([Page(out, **levels)] if watch else [])
-            shown.extend([] if bar.silent else [screen.enter_context(Live(**levels))])
-            shown.append(lambda _: None)
+            shown = [Page(out, **levels)] if watch else []
+            shown += [] if bar.silent else [screen.enter_context(Live(**levels))]
         for show in shown:
             show(progress)
 

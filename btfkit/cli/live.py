@@ -12,7 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from btfkit.devices.capture.engine import Progress
+    from btfkit.devices.capture.progress import Progress
 
 # Cells of the picture; each holds two pixels, one above the other.
 _COLUMNS, _ROWS = 48, 18

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self, final
@@ -25,6 +26,7 @@ from btfkit.errors import DeviceError
 
 # Added to what a command should take: USB, settling and a busy machine.
 _SLACK_S = 10.0
+_STOP_S = 6.0
 
 
 @final
@@ -257,6 +259,8 @@ class Rig(ABC):
     def __init__(self, serial: str, watchdog: Watchdog) -> None:
         self.serial = serial
         self._watchdog = watchdog
+        # Stops do not wait behind the call that they are to stop.
+        self._stops = Watchdog(f"stops of {serial}")
         self._owner = Owner(serial)
         self._open = False
 
@@ -289,6 +293,7 @@ class Rig(ABC):
             self._watchdog.run("closing", self._end, deadline_s=_SLACK_S)
         finally:
             self._watchdog.close()
+            self._stops.close()
             self._owner.release()
 
     def __enter__(self) -> Self:
@@ -300,6 +305,10 @@ class Rig(ABC):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        if error is not None:
+            # Whatever was going on, interrupted or failed, does not go on alone.
+            with suppress(DeviceError):
+                self.abort()
         try:
             self.close()
         except DeviceError:
@@ -315,17 +324,26 @@ class Rig(ABC):
     def now(self) -> float:
         """The rig's clock, seconds."""
 
-    @abstractmethod
     def stop(self) -> None:
         """Decelerate all axes; positions stay known. May be called from another thread."""
+        self._stops.run("a stop", self._stop, deadline_s=_STOP_S)
 
-    @abstractmethod
     def abort(self) -> None:
-        """Drop the exposure and all pending commands, then stop."""
+        """Drop the exposure and all pending commands, then stop. From any thread."""
+        self._stops.run("an abort", self._abort, deadline_s=_STOP_S)
+
+    def emergency_stop(self) -> None:
+        """Lamp and drivers off at once; the rig must be homed before it moves. From any thread."""
+        self._stops.run("an emergency stop", self._emergency_stop, deadline_s=_STOP_S)
 
     @abstractmethod
-    def emergency_stop(self) -> None:
-        """Lamp and drivers off at once; the rig must be homed before it moves again."""
+    def _stop(self) -> None: ...
+
+    @abstractmethod
+    def _abort(self) -> None: ...
+
+    @abstractmethod
+    def _emergency_stop(self) -> None: ...
 
     @abstractmethod
     def _begin(self) -> None: ...

@@ -108,13 +108,13 @@ class UsbRig(Rig):
     def now(self) -> float:
         return self._clock.now()
 
-    def stop(self) -> None:
+    def _stop(self) -> None:
         self.link.send(Command.STOP)
 
-    def abort(self) -> None:
+    def _abort(self) -> None:
         self.link.send(Command.ABORT)
 
-    def emergency_stop(self) -> None:
+    def _emergency_stop(self) -> None:
         self.link.send(Command.EMERGENCY_STOP)
 
     def _begin(self) -> None:

@@ -102,7 +102,7 @@ def test_info_lists_the_rigs_that_can_be_driven(capsys):
 def test_the_terminal_shows_progress_drift_and_the_last_frame():
     from btfkit.cli.live import drawn
     from btfkit.devices.capture.drift import Drift
-    from btfkit.devices.capture.engine import Progress
+    from btfkit.devices.capture.progress import Progress
 
     image = np.full((48, 64), 200, np.uint16)
     image[:, 32:] = 4095

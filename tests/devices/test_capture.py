@@ -30,6 +30,7 @@ from btfkit.devices.capture.run import measure
 from btfkit.devices.capture.steps import estimate, steps_of
 from btfkit.devices.capture.store import Nowhere, begin
 from btfkit.devices.twin import layout
+from btfkit.devices.twin.lamp import NONE
 from btfkit.devices.twin.log import Twin, TwinLog, everything
 from btfkit.devices.twin.truth import truth
 from btfkit.devices.twin.world import World
@@ -296,6 +297,30 @@ def test_another_plan_rig_or_folder_is_not_gone_on_with(copy, tmp_path):
         measure(other, plans.from_document("small", SMALL), copy, resume=True)
 
 
+def test_an_interruption_darkens_the_rig_and_keeps_what_is_finished(tmp_path):
+    def interrupt(step):
+        if step.kind == "sample":
+            raise KeyboardInterrupt
+
+    folder = tmp_path / "run"
+    log = TwinLog(folder, QUIET)
+    rig = mock.open_rig(log.begin(), log=log)
+    with pytest.raises(KeyboardInterrupt):
+        measure(rig, plans.from_document("small", SMALL), folder, watch=interrupt)
+    assert rig._transport._device._ctx.backend._peripheral.world.lamp.source == NONE
+    sequence = Sequence.open(folder)
+    assert not sequence.document["complete"]
+    assert sequence.of_kind("target")
+    assert not sequence.of_kind("sample")
+    assert run(folder, resume=True).frames == 25
+
+
+def test_a_run_whose_frames_are_gone_is_refused(copy):
+    (copy / "frames/000003-0.png").unlink()
+    with pytest.raises(DeviceError, match=r"1 of 25 frames .* are gone, first frames/000003-0\.png"):
+        run(copy, resume=True)
+
+
 def test_a_disk_that_is_too_small_is_refused_before_anything_moves(tmp_path):
     with pytest.raises(DeviceError, match=r"the run takes up to 1000000000\.0 GB"):
         begin(tmp_path / "run", SMALL, resume=False, storage=1e18)
@@ -390,7 +415,7 @@ def test_there_is_no_truth_of_what_was_not_measured(tmp_path, copy):
 
 def test_the_page_shows_where_the_run_is(tmp_path):
     from btfkit.devices.capture.drift import Drift
-    from btfkit.devices.capture.engine import Progress
+    from btfkit.devices.capture.progress import Progress
 
     page = Page(tmp_path, black=200, white=4095)
     page(Progress(3, 10, "sample", 7, 1, Drift(0.01, 0.2), np.full((48, 64), 2000, np.uint16)))

@@ -89,9 +89,9 @@ def test_what_does_not_stop_is_refused_with_its_reason_and_resumed_later(name, m
 
 @pytest.mark.parametrize("name", ["late-reply", "duplicate"])
 def test_replies_that_always_come_late_or_twice_slow_a_run_and_harm_it_not(name, tmp_path):
-    faults, watch = armed(name, "white", 200)
+    faults, watch = armed(name, "white", 100)
     assert run(tmp_path / "run", faults=faults, watch=watch).frames == FRAMES
-    assert faults.struck[name] == 200
+    assert faults.struck[name] == 100
     assert check_every_frame(tmp_path / "run") == FRAMES
 
 

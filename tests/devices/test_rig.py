@@ -229,6 +229,39 @@ def test_whoever_waits_for_a_motion_is_told_that_it_was_stopped():
             rig.stage.move_to(turntable=1.0)
 
 
+def test_a_stop_from_another_thread_does_not_wait_for_the_motion():
+    class Slow:
+        """A rig of which a motion takes wall time."""
+
+        def __init__(self, firmware):
+            self._firmware = firmware
+            self.moving = threading.Event()
+
+        def receive(self, data):
+            self._firmware.receive(data)
+            if data[3] == Command.MOVE:
+                self.moving.set()
+
+        def take(self, timeout_s):
+            if self.moving.is_set() and not self._firmware._out:
+                time.sleep(0.01)
+                self._firmware.world.clock.wait(1e-4)
+                return b""
+            return self._firmware.take(timeout_s)
+
+    world = World(SMALL.setup(blind=True))
+    slow = Slow(Firmware(world, Faults()))
+    with usb_driver.open_rig(backend=a_bus(slow), clock=world.clock) as rig:
+        rig.stage.home()
+        stopper = threading.Thread(target=lambda: slow.moving.wait(5) and rig.stop())
+        stopper.start()
+        with pytest.raises(DeviceError, match="the rig was stopped"):
+            rig.stage.move_to(turntable=3.0)
+        stopper.join()
+        slow.moving.clear()
+        assert State.HOMED in status_of(rig).state
+
+
 def test_an_unplugged_rig_is_said_to_be_gone_and_is_let_go():
     with (
         pytest.raises(UnpluggedError, match="gone from the bus .*--resume"),

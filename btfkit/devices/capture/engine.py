@@ -8,7 +8,6 @@ goes on from the groups that count.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -18,8 +17,10 @@ from btfkit.devices.base import Exposure, FrameLostError, PositionError, Rig
 from btfkit.devices.capture.aim import Aim
 from btfkit.devices.capture.drift import Drift, compared
 from btfkit.devices.capture.journal import Record
+from btfkit.devices.capture.lamp import LampError, Lighting
 from btfkit.devices.capture.metering import metered, on_grid
 from btfkit.devices.capture.plan import Plan
+from btfkit.devices.capture.progress import Observer, Progress
 from btfkit.devices.capture.steps import FRAME, HIGHLIGHT, WHITE, Step, steps_of
 from btfkit.devices.capture.store import FRAMES, Store, finished_groups
 from btfkit.errors import DeviceError
@@ -27,37 +28,7 @@ from btfkit.errors import DeviceError
 _TRIES = 4
 # A pose whose exposures lie further from what was asked than this is not that pose.
 _OFF_RAD = 4e-4
-# A lit lamp reads about 1; what is far from that has gone out, or never was this lamp.
-_DIM, _GLARING, _DARK = 0.5, 2.0, 0.05
-_WARM_STEP_S, _WARM_CHANGE, _READINGS = 30.0, 1e-3, 8
 _GUESS_S = 0.02
-
-
-class LampError(DeviceError):
-    """The lamp does not burn as it should; lighting it again may help."""
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Progress:
-    """What a run looks like from outside.
-
-    Attributes:
-        done, total: groups. kind: of the present one. frames: so far, in this session.
-        retries: repeated groups and exposures. drift: at the last look at the reference.
-        image: the last frame.
-    """
-
-    done: int
-    total: int
-    kind: str
-    frames: int
-    retries: int
-    drift: Drift | None
-    image: NDArray[np.uint16]
-
-
-Observer = Callable[[Progress], None]
 
 
 @final
@@ -89,8 +60,8 @@ class Engine:
         self.steps = steps_of(plan, rig.description, axes)
         self._check_plan()
         self.frames = self.retries = 0
-        self._source: str | None = "unknown"
-        self._warm = self._rehomed = False
+        self._lighting = Lighting(rig, plan.warm_s)
+        self._rehomed = False
         self._guesses: dict[str, float] = {}
         self._offset_s = 0.0
         self._drift: Drift | None = None
@@ -110,10 +81,8 @@ class Engine:
         self._first = references[0][0] if references else None
         self._begin_session()
         self._home()
-        if self._first is not None:
-            self._check_reference(self._first)
-        # Homing at the start of a session needs no look at the reference beyond that.
-        self._rehomed = False
+        # With frames of earlier sessions there, the first thing is to see whether they mix.
+        self._rehomed = True
         for step in self.steps:
             if step.index not in done:
                 self._take(step)
@@ -175,9 +144,7 @@ class Engine:
             except LampError as error:
                 last = error
                 self._again(step, attempt, error)
-                # Off first: a rig may take a lamp that it believes lit for lit.
-                self._rig.light.switch(None)
-                self._source, self._warm = None, False
+                self._lighting.relight()
             except FrameLostError as error:
                 last = error
                 self._again(step, attempt, error)
@@ -193,7 +160,7 @@ class Engine:
         )
 
     def _attempt(self, step: Step, attempt: int) -> None:
-        self._light(step.source)
+        self._lighting.use(step.source)
         if step.places:
             self._rig.stage.move_to(**step.places)
             self._rig.wait(self._plan.settle_s)
@@ -243,39 +210,8 @@ class Engine:
                     f"{name} stood at {exposure.axes[name]:.6g} instead of {place:.6g} during the "
                     "exposure"
                 )
-        if step.source is None and exposure.lamp > _DARK:
-            raise LampError(f"the lamp reads {exposure.lamp:.3g} in a dark frame")
-        if step.source is not None and not _DIM < exposure.lamp < _GLARING:
-            raise LampError(f"the {step.source} reads {exposure.lamp:.3g} of its nominal power")
+        self._lighting.check(step.source, exposure)
         return exposure
-
-    def _light(self, source: str | None) -> None:
-        if source != self._source:
-            self._rig.light.switch(source)
-            self._source = source
-            self._warm = False
-        if source is not None and not self._warm:
-            self._warm_up()
-            self._warm = True
-
-    def _warm_up(self) -> None:
-        """Wait until the lamp is steady, or as long as the plan allows."""
-        if self._plan.warm_s <= 0:
-            return
-        before, waited = self._power(), 0.0
-        while waited < self._plan.warm_s:
-            self._rig.wait(_WARM_STEP_S)
-            waited += _WARM_STEP_S
-            now = self._power()
-            if now > _DIM and abs(now / before - 1) < _WARM_CHANGE:
-                return
-            before = max(now, 1e-9)
-        raise LampError(
-            f"the lamp has not settled in {waited:g} s: its monitor reads {before:.4g}"
-        )
-
-    def _power(self) -> float:
-        return float(np.mean([self._rig.light.reading() for _ in range(_READINGS)]))
 
     def _times(self, step: Step) -> tuple[float, ...]:
         """Exposures of a step: fixed, those of the first reference, or metered."""
@@ -346,7 +282,7 @@ class Engine:
             DeviceError: it moved, or its level changed, by more than the plan allows.
         """
         step = next(step for step in self.steps if step.kind == "reference")
-        self._light(step.source)
+        self._lighting.use(step.source)
         self._rig.stage.move_to(**step.places)
         self._rig.wait(self._plan.settle_s)
         exposure = self._exposed(step, first["exposure_s"])

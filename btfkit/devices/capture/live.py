@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.devices.capture.engine import Progress
+from btfkit.devices.capture.progress import Progress
 from btfkit.files import whole
 from btfkit.io.images import encode_png
 

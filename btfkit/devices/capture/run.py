@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import final
 
 from btfkit.devices.base import Rig
-from btfkit.devices.capture.engine import Engine, Observer
+from btfkit.devices.capture.engine import Engine
 from btfkit.devices.capture.plan import Plan
+from btfkit.devices.capture.progress import Observer
 from btfkit.devices.capture.steps import Step, estimate, steps_of
 from btfkit.devices.capture.store import Folder, begin, finished_groups
 from btfkit.devices.faults import Faults
@@ -58,10 +59,11 @@ def measure(
         folder = Folder(path, faults=faults, kill=kill)
         began = rig.now()
         try:
+            folder.check_frames()
             engine = Engine(rig, plan, folder, observer=observer, watch=watch)
             try:
                 engine.run()
-            except Exception:
+            except (Exception, KeyboardInterrupt):
                 # The first error is the one to tell, also where the disk is full.
                 with suppress(OSError):
                     folder.finish(rig.description, complete=False, synthetic=synthetic)

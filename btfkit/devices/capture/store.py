@@ -116,6 +116,22 @@ class Folder:
     def image(self, name: str) -> NDArray[Any]:
         return counts.read(name, (self.path / name).read_bytes())
 
+    def check_frames(self) -> None:
+        """Refuse a run some of whose finished frames are gone.
+
+        Raises:
+            DeviceError: names the first.
+        """
+        there = {entry.name for entry in os.scandir(self.path / FRAMES)}
+        finished = [f for group in finished_groups(self.records).values() for f in group]
+        gone = [f["file"] for f in finished if Path(f["file"]).name not in there]
+        if gone:
+            raise DeviceError(
+                f"{self.path}: {len(gone)} of {len(finished)} frames that the journal lists are "
+                f"gone, first {gone[0]}",
+                remedy="put them back, or begin a new run in another folder",
+            )
+
     def finish(self, description: Mapping[str, Any], *, complete: bool, synthetic: bool) -> None:
         """Write sequence.csv and sequence.json of the groups that are complete."""
         frames = finished_frames(self.records)
