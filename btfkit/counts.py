@@ -54,11 +54,13 @@ def read(name: str, data: bytes) -> Counts:
 
 
 def encode_png(counts: NDArray[np.uint16]) -> bytes:
-    """A (h, w) frame as a PNG of 16 bits, lossless; the same counts give the same bytes."""
+    """A (h, w) or (h, w, 3) frame as a PNG of 16 bits; the same counts give the same bytes."""
     import cv2
 
-    if counts.dtype != np.uint16 or counts.ndim != 2:
-        raise ValueError(f"counts are {counts.dtype} {counts.shape}; expected uint16 (h, w)")
+    if counts.dtype != np.uint16 or counts.shape[2:] not in ((), (3,)) or counts.ndim < 2:
+        raise ValueError(f"counts are {counts.dtype} {counts.shape}; expected uint16 (h, w[, 3])")
+    if counts.ndim == 3:
+        counts = np.ascontiguousarray(counts[..., ::-1])
     # Level 1: noise does not shrink further, and the camera waits for the disk.
     done, data = cv2.imencode(".png", counts, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:

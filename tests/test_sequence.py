@@ -190,6 +190,8 @@ def test_counts_come_as_the_file_has_them():
     raw = rng.integers(0, 65536, (5, 7), dtype=np.uint16)
     np.testing.assert_array_equal(counts.read("a.png", counts.encode_png(raw)), raw)
     np.testing.assert_array_equal(counts.read("a.tif", cv2.imencode(".tif", raw)[1].tobytes()), raw)
+    rgb = rng.integers(0, 65536, (5, 7, 3), dtype=np.uint16)
+    np.testing.assert_array_equal(counts.read("a.png", counts.encode_png(rgb)), rgb)
     colours = rng.integers(0, 256, (5, 7, 3), dtype=np.uint8)
     coded = cv2.imencode(".png", colours[..., ::-1])[1].tobytes()
     np.testing.assert_array_equal(counts.read("a.png", coded), colours)
@@ -215,6 +217,6 @@ def test_what_is_no_frame_is_refused(name, message):
         counts.read(name, b"no image at all")
 
 
-def test_a_png_holds_one_plane_of_16_bits():
-    with pytest.raises(ValueError, match=r"expected uint16 \(h, w\)"):
+def test_a_png_holds_one_or_three_planes_of_16_bits():
+    with pytest.raises(ValueError, match=r"expected uint16 \(h, w\[, 3\]\)"):
         counts.encode_png(np.zeros((3, 3)))

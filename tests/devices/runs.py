@@ -96,7 +96,7 @@ def _light(world: World, source: int, angles: tuple[tuple[str, float], ...]) -> 
     if source == PANEL:
         return sensor.filtered(np.repeat(0.5 * scene.lens.flat()[..., None], 3, axis=-1))
     if source == NONE:
-        return np.zeros(sensor.size, np.float32)
+        return sensor.filtered(np.zeros((*sensor.size, 3), np.float32))
     return sensor.filtered(scene.image(world.truth.placed(dict(angles))))
 
 

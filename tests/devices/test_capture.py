@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from runs import QUIET, SMALL, run
+from runs import QUIET, SMALL, check_every_frame, run
 
 from btfkit import directions
 from btfkit.devices import mock
@@ -268,6 +268,20 @@ def test_a_run_is_a_sequence_with_everything_in_it(finished):
     for frame in sequence.frames:
         lit = frame.lamp is not None and frame.lamp > 0.5
         assert lit == (frame.kind != "dark")
+
+
+def test_a_perfect_rig_gives_three_colours_a_pixel_at_the_poses_that_were_asked(tmp_path):
+    folder = tmp_path / "run"
+    twin = Twin("print", 64, 48, without=everything())
+    run(folder, twin=twin)
+    sequence = Sequence.open(folder)
+    assert (sequence.sensor.cfa, sequence.sensor.bits) == ("none", 16)
+    assert check_every_frame(folder) == len(sequence) == 25
+    records = [r for r in read(folder / "journal.jsonl")[0] if r["record"] == "frame"]
+    for record, frame in zip(records, sequence.frames, strict=True):
+        assert sequence.image(sequence.frames.index(frame)).shape == (48, 64, 3)
+        for name, place in record["requested"].items():
+            assert record["axes"][name] == pytest.approx(place, abs=1e-12)
 
 
 def test_equal_seeds_give_equal_runs(finished, tmp_path):
