@@ -234,6 +234,18 @@ def test_highlights_lie_where_a_sphere_mirrors_the_lamp():
         np.testing.assert_allclose(middle, scene.lens.pixels(place, at), atol=3e-3)
 
 
+@pytest.mark.parametrize(("half", "middle"), [(18, (0, 0)), (5, layout.WHITE_AT)])
+def test_spheres_shade_and_hide_neither_sample_nor_white_down_to_75_degrees(half, middle):
+    spheres = World(Twin("print", 64, 48).setup())._scene._spheres
+    side = np.linspace(-half, half, 25)
+    x, y = np.meshgrid(side + middle[0], side + middle[1])
+    points = np.stack([x, y, 0 * x], axis=-1).astype(np.float32)
+    for azimuth in range(0, 360, 4):
+        for distance in (layout.LAMP_MM, layout.CAMERA_MM):
+            assert not spheres.shaded(points, distance * spherical(75, azimuth)).any()
+    assert spheres.shaded(points, layout.LAMP_MM * spherical(88, 35)).any()
+
+
 def test_what_is_drawn_repeats_by_its_seed_and_differs_by_another():
     def frame(seed: int) -> np.ndarray:
         world = World(Twin("print", 64, 48, seed=seed).setup())
