@@ -232,9 +232,7 @@ class Light(ABC):
         """
         if source is not None and source not in self.sources:
             raise DeviceError(f"no light {source!r}; this rig has {', '.join(self.sources)}")
-        self._watchdog.run(
-            "switching the light", lambda: self._switch(source), deadline_s=_SLACK_S
-        )
+        self._watchdog.run("switching the light", lambda: self._switch(source), deadline_s=_SLACK_S)
 
     def reading(self) -> float:
         """Of the monitor, relative to nominal power; about 0 when dark."""

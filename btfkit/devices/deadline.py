@@ -84,7 +84,7 @@ class _Call:
     def run(self) -> None:
         try:
             self.result = self._call()
-        except BaseException as error:  # noqa: BLE001  the caller's thread raises it
+        except BaseException as error:
             self.error = error
         finally:
             self.done.set()

@@ -54,7 +54,10 @@ class Chains:
     def nominal(description: Mapping[str, Any]) -> Chains:
         """As a rig describes itself."""
         lines = {
-            axis["name"]: (np.asarray(axis["direction"], float), np.asarray(axis["point_mm"], float))
+            axis["name"]: (
+                np.asarray(axis["direction"], float),
+                np.asarray(axis["point_mm"], float),
+            )
             for axis in description["axes"]
         }
         return Chains(lines, description["carries"])

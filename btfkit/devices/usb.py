@@ -32,7 +32,7 @@ from btfkit.devices.bulk import Bulk, libusb
 from btfkit.devices.clock import Clock, WallClock
 from btfkit.devices.deadline import Watchdog
 from btfkit.devices.wire import messages
-from btfkit.devices.wire.link import Link, Refused
+from btfkit.devices.wire.link import Link, RefusedError
 from btfkit.devices.wire.messages import Command, Event, Exposed, Hello, Refusal, State, Status
 from btfkit.devices.wire.packets import Packet
 from btfkit.errors import DeviceError
@@ -122,8 +122,7 @@ class UsbRig(Rig):
         hello = _parsed(Hello.parsed, self.link.request(Command.HELLO))
         if hello.protocol != messages.PROTOCOL:
             raise DeviceError(
-                f"rig {self.serial} speaks protocol {hello.protocol}; expected "
-                f"{messages.PROTOCOL}",
+                f"rig {self.serial} speaks protocol {hello.protocol}; expected {messages.PROTOCOL}",
                 remedy="update its firmware, or btfkit",
             )
         if hello.description > _MOST_DESCRIPTION:
@@ -199,7 +198,7 @@ class UsbStage(Stage):
         ends = (event, Event.LIMIT)
         packet = self._link.event(lambda p: p.code in ends, timeout_s=timeout_s)
         status = self._status()
-        if packet is not None and packet.code == Event.LIMIT or State.LIMIT in status.state:
+        if (packet is not None and packet.code == Event.LIMIT) or State.LIMIT in status.state:
             raise PositionError("an axis ran into its limit switch", remedy="home the rig")
         # An event may be lost on the way; the status then tells that the motion is over.
         if packet is None and State.MOVING in status.state:
@@ -262,7 +261,7 @@ class UsbCamera(Camera):
             raise FrameLostError(f"a frame of {exposed.size} bytes; the sensor has {most}")
         try:
             return self._link.fetch(exposed.frame, exposed.size)
-        except Refused as error:
+        except RefusedError as error:
             if error.refusal is Refusal.NO_FRAME:
                 raise FrameLostError(f"frame {exposed.frame} is gone ({error})") from error
             raise

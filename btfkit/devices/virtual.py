@@ -193,7 +193,9 @@ class VirtualBus(usb.backend.IBackend):  # type: ignore[misc]
 
     def _there(self) -> None:
         if not self.plugged:
-            raise usb.core.USBError("No such device (it may have been disconnected)", -4, errno.ENODEV)
+            raise usb.core.USBError(
+                "No such device (it may have been disconnected)", -4, errno.ENODEV
+            )
 
     def _only(self, *numbers: int) -> None:
         if any(numbers):

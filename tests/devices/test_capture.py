@@ -331,7 +331,9 @@ def test_an_interruption_darkens_the_rig_and_keeps_what_is_finished(tmp_path):
 
 def test_a_run_whose_frames_are_gone_is_refused(copy):
     (copy / "frames/000003-0.png").unlink()
-    with pytest.raises(DeviceError, match=r"1 of 25 frames .* are gone, first frames/000003-0\.png"):
+    with pytest.raises(
+        DeviceError, match=r"1 of 25 frames .* are gone, first frames/000003-0\.png"
+    ):
         run(copy, resume=True)
 
 

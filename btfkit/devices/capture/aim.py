@@ -46,7 +46,9 @@ class Aim:
         theta_v, phi_v = directions.to_angles(view)
         theta_l, phi_l = directions.to_angles(light)
         turn = _from_zero(-np.asarray(phi_v, np.float64))
-        return np.stack([turn, theta_v, _from_zero(np.asarray(phi_l, np.float64) + turn), theta_l], axis=-1)
+        return np.stack(
+            [turn, theta_v, _from_zero(np.asarray(phi_l, np.float64) + turn), theta_l], axis=-1
+        )
 
     def pixels(self, places: Mapping[str, float], points: Floats) -> Floats:
         """(n, 2) columns and rows where (n, 3) points of the sample's frame are seen, nominal."""
@@ -62,7 +64,9 @@ class Aim:
         shape = (int(sensor["height"]), int(sensor["width"]))
         x, y = area.get("centre_mm", (0.0, 0.0))[:2]
         w, h = (0.8 * side / 2 for side in area["size_mm"])
-        corners = np.array([[x - w, y - h, 0], [x + w, y - h, 0], [x + w, y + h, 0], [x - w, y + h, 0]])
+        corners = np.array(
+            [[x - w, y - h, 0], [x + w, y - h, 0], [x + w, y + h, 0], [x - w, y + h, 0]]
+        )
         col, row = self.pixels(places, corners).T
         rows, cols = np.mgrid[: shape[0], : shape[1]]
         inside = [

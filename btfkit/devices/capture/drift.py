@@ -45,9 +45,7 @@ def binned(image: NDArray[np.uint16]) -> NDArray[np.float64]:
     return np.asarray(grey[:h, :w].reshape(h // 2, 2, w // 2, 2).mean((1, 3)))
 
 
-def moved(
-    first: NDArray[np.float64], now: NDArray[np.float64]
-) -> tuple[float, float]:
+def moved(first: NDArray[np.float64], now: NDArray[np.float64]) -> tuple[float, float]:
     """Rows and columns by which a picture has moved, by windowed cross-correlation.
 
     Good to a twentieth of a pixel on a picture with edges: enough to see that something gave way.

@@ -77,7 +77,9 @@ class Engine:
             DeviceError: what cannot be put right; what is finished stays.
         """
         done = finished_groups(self._store.records)
-        references = [frames for _, frames in sorted(done.items()) if frames[0]["kind"] == "reference"]
+        references = [
+            frames for _, frames in sorted(done.items()) if frames[0]["kind"] == "reference"
+        ]
         self._first = references[0][0] if references else None
         self._begin_session()
         self._home()
@@ -115,7 +117,9 @@ class Engine:
         """Refuse before anything moves what the rig cannot do."""
         limits = self._rig.camera.limits
         if self._plan.iso not in limits.isos:
-            raise DeviceError(f"the plan asks for ISO {self._plan.iso:g}; the camera has {limits.isos}")
+            raise DeviceError(
+                f"the plan asks for ISO {self._plan.iso:g}; the camera has {limits.isos}"
+            )
         for step in self.steps:
             self._rig.stage.check(step.places)
             for time_s in step.bracket.times_s or ():
@@ -149,7 +153,7 @@ class Engine:
                 last = error
                 self._again(step, attempt, error)
         raise DeviceError(
-            f"{step.kind} frames of group {step.index} failed {_TRIES} times; the last time: {last}",
+            f"{step.kind} frames of group {step.index} failed {_TRIES} times; the last: {last}",
             remedy="look at the rig, then start again with --resume",
         )
 
@@ -306,7 +310,10 @@ class Engine:
             {"record": "drift", "level": drift.level, "shift_px": drift.shift_px,
              "time_s": self._rig.now() + self._offset_s}
         )  # fmt: skip
-        if abs(drift.level) > self._plan.reference_level or drift.shift_px > self._plan.reference_px:
+        if (
+            abs(drift.level) > self._plan.reference_level
+            or drift.shift_px > self._plan.reference_px
+        ):
             raise DeviceError(
                 f"the reference has changed by {100 * drift.level:.2f} % and moved by "
                 f"{drift.shift_px:.2f} px since the run began; the plan allows "
@@ -320,4 +327,3 @@ class Engine:
                 Progress(step.index + 1, len(self.steps), step.kind, self.frames, self.retries,
                          self._drift, self._image)
             )  # fmt: skip
-

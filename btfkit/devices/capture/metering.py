@@ -59,7 +59,9 @@ def metered(
         else:
             break
     first = min(max(time_s * _AIM / max(level, 1e-3), low), longest)
-    times = [min(max(on_grid(first), low) * bracket.ratio**k, longest) for k in range(bracket.count)]
+    times = [
+        min(max(on_grid(first), low) * bracket.ratio**k, longest) for k in range(bracket.count)
+    ]
     return tuple(dict.fromkeys(times))
 
 

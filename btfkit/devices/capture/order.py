@@ -51,7 +51,9 @@ def travel_s(places: Floats, axes: Sequence[Axis]) -> Floats:
         step = steps[:, column]
         down = step < -axis.resolution
         longest = np.maximum(longest, _rest_to_rest(np.where(down, step - margin, step), axis))
-        second = np.maximum(second, np.where(down, _rest_to_rest(np.full_like(step, margin), axis), 0))
+        second = np.maximum(
+            second, np.where(down, _rest_to_rest(np.full_like(step, margin), axis), 0)
+        )
     return longest + second
 
 

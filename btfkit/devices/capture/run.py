@@ -71,8 +71,6 @@ def measure(
             folder.finish(rig.description, complete=True, synthetic=synthetic)
             groups = finished_groups(folder.records)
             frames = sum(len(each) for each in groups.values())
-            return Report(
-                len(groups), frames, engine.frames, engine.retries, rig.now() - began
-            )
+            return Report(len(groups), frames, engine.frames, engine.retries, rig.now() - began)
         finally:
             folder.close()

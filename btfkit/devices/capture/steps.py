@@ -66,7 +66,9 @@ def steps_of(plan: Plan, description: Mapping[str, Any], axes: Sequence[Axis]) -
     build.poses("white", *_whites(plan.whites), plan.bracket, WHITE)
     build.poses("colour", *_whites(plan.colours), plan.bracket, WHITE)
     build.poses("target", *_targets(plan.targets), plan.bracket, WHITE)
-    build.poses("sphere", *_spheres(plan.spheres), Bracket(2, 64.0, plan.bracket.longest_s), HIGHLIGHT)
+    build.poses(
+        "sphere", *_spheres(plan.spheres), Bracket(2, 64.0, plan.bracket.longest_s), HIGHLIGHT
+    )
     places = aim.axes(plan.views[plan.pairs[:, 0]], plan.lights[plan.pairs[:, 1]])
     order = ordered(places, axes)
     for number, row in enumerate(order):
@@ -113,7 +115,9 @@ def estimate(
 def reference_step(index: int, aim: Aim, plan: Plan) -> Step:
     """The pose and exposures that are repeated."""
     view, light = _degrees([0.0], [0.0]), _degrees([30.0], [60.0])
-    bracket = Bracket(1, 2.0, plan.bracket.longest_s, plan.bracket.times_s and (plan.bracket.times_s[0],))
+    bracket = Bracket(
+        1, 2.0, plan.bracket.longest_s, plan.bracket.times_s and (plan.bracket.times_s[0],)
+    )
     return Step(index, "reference", _named(aim.axes(view, light)[0]), "lamp", bracket, WHITE)
 
 
@@ -139,7 +143,13 @@ class _Builder:
     def ramp(self, kind: str, source: str | None, ramp: Ramp) -> None:
         for time_s in ramp.times_s:
             if ramp.count:
-                self.add(kind, None, source, Bracket(ramp.count, 2.0, time_s, (time_s,) * ramp.count), FRAME)
+                self.add(
+                    kind,
+                    None,
+                    source,
+                    Bracket(ramp.count, 2.0, time_s, (time_s,) * ramp.count),
+                    FRAME,
+                )
 
     def reference(self, plan: Plan) -> None:
         if plan.reference_every:

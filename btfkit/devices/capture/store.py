@@ -184,9 +184,7 @@ def begin(path: Path, document: Mapping[str, Any], *, resume: bool, storage: flo
         if not (path / NAME).is_file() or not (path / PLAN).is_file():
             raise FileNotFoundError(f"{path}: no run to resume; leave out --resume to begin one")
         if documents.fingerprint(documents.load(path / PLAN)) != documents.fingerprint(document):
-            raise DeviceError(
-                f"{path} was begun with another plan", remedy=f"--plan {path / PLAN}"
-            )
+            raise DeviceError(f"{path} was begun with another plan", remedy=f"--plan {path / PLAN}")
         return
     refuse_begun(path)
     path.mkdir(parents=True, exist_ok=True)
@@ -225,25 +223,24 @@ def finished_groups(records: Sequence[Record]) -> dict[int, list[Record]]:
 
 def finished_frames(records: Sequence[Record]) -> list[Frame]:
     """What the table lists: the frames of complete groups, in the order of the run."""
-    listed = []
-    for _, frames in sorted(finished_groups(records).items()):
-        for record in frames:
-            listed.append(
-                Frame(
-                    file=record["file"],
-                    kind=record["kind"],
-                    axes=record["axes"],
-                    exposure_s=record["exposure_s"],
-                    iso=record["iso"],
-                    lamp=max(record["lamp"], 0.0),
-                    time_s=record["time_s"],
-                    temperature_c=record["temperature_c"],
-                    group=record["group"],
-                    sha256=record["sha256"],
-                    extra={} if record["pair"] is None else {"pair": str(record["pair"])},
-                )
-            )
-    return listed
+    groups = sorted(finished_groups(records).items())
+    return [_frame(record) for _, frames in groups for record in frames]
+
+
+def _frame(record: Record) -> Frame:
+    return Frame(
+        file=record["file"],
+        kind=record["kind"],
+        axes=record["axes"],
+        exposure_s=record["exposure_s"],
+        iso=record["iso"],
+        lamp=max(record["lamp"], 0.0),
+        time_s=record["time_s"],
+        temperature_c=record["temperature_c"],
+        group=record["group"],
+        sha256=record["sha256"],
+        extra={} if record["pair"] is None else {"pair": str(record["pair"])},
+    )
 
 
 def sensor_section(description: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.devices.twin import layout
 from btfkit.devices.poses import Floats
+from btfkit.devices.twin import layout
 from btfkit.devices.twin.geometry import Truth
 
 Image = NDArray[np.float32]
@@ -116,13 +116,13 @@ def board_cells() -> list[tuple[float, float, float, bool]]:
     As OpenCV's CharucoBoard of the same numbers has them.
     """
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, layout.DICTIONARY))
-    board = cv2.aruco.CharucoBoard(
-        layout.BOARD, layout.SQUARE_MM, layout.MARKER_MM, dictionary
-    )
+    board = cv2.aruco.CharucoBoard(layout.BOARD, layout.SQUARE_MM, layout.MARKER_MM, dictionary)
     across, down = layout.BOARD
     modules = dictionary.markerSize + 2
     marked = {}
-    for number, corners in zip(np.asarray(board.getIds()).ravel(), board.getObjPoints(), strict=True):
+    for number, corners in zip(
+        np.asarray(board.getIds()).ravel(), board.getObjPoints(), strict=True
+    ):
         left, top = (float(c) for c in np.asarray(corners)[0, :2])
         marked[int(left / layout.SQUARE_MM), int(top / layout.SQUARE_MM)] = (number, left, top)
     cells: list[tuple[float, float, float, bool]] = []

@@ -11,7 +11,7 @@ IMPERFECTIONS: dict[str, str] = {
     "eccentricity": "encoders that are off centre, 0.003 degrees, and rounded",
     "homing": "switches that repeat to 0.002 degrees",
     "axes": "axes that are tilted by up to 0.1 degrees and displaced by up to 0.3 mm",
-    "camera-pose": "a camera displaced by up to 1 mm, turned by up to 0.2 degrees, focal length 0.5 % off",
+    "camera-pose": "a camera up to 1 mm and 0.2 degrees off, its focal length up to 0.5 %",
     "lamp-pose": "a lamp displaced by up to 2 mm",
     "holder": "board, patches and spheres displaced by up to 0.02, 0.15 and 0.2 mm",
     "warm-up": "a lamp that starts 8 % too bright",

@@ -24,7 +24,11 @@ WHITE_MM, WHITE_AT = 10.0, (32.0, 0.0)
 WHITE_REFLECTANCE = (0.985, 0.985, 0.98)
 WHITE_ANGULAR = (1.03, -0.035, 0.02)
 PATCH_MM, PITCH_MM, STRIPS_MM = 5.0, 5.5, (32.3, 26.8, -26.8, -32.3)
-SPHERE_MM, SPHERES_AT, SUNK_MM = 8.0, ((-46.0, 30.0), (46.0, 30.0), (-46.0, -30.0), (46.0, -30.0)), 2.0
+SPHERE_MM, SPHERES_AT, SUNK_MM = (
+    8.0,
+    ((-46.0, 30.0), (46.0, 30.0), (-46.0, -30.0), (46.0, -30.0)),
+    2.0,
+)
 # A chart of 24 colours, 8-bit sRGB.
 CHART = {
     "dark skin": (115, 82, 68), "light skin": (194, 150, 130), "blue sky": (98, 122, 157),
@@ -107,9 +111,7 @@ def target() -> dict[str, Any]:
             "angular": list(WHITE_ANGULAR),
         },
         "patches": patches(),
-        "spheres": [
-            {"centre_mm": [x, y, -SUNK_MM], "radius_mm": SPHERE_MM} for x, y in SPHERES_AT
-        ],
+        "spheres": [{"centre_mm": [x, y, -SUNK_MM], "radius_mm": SPHERE_MM} for x, y in SPHERES_AT],
     }
 
 

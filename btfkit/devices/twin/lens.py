@@ -46,7 +46,9 @@ class Lens:
         x, y = np.meshgrid(cols, rows)
         seen = np.stack([x, y], axis=-1)
         self.rays = self._undistorted((seen - truth.centre_px) / truth.focal_px).astype(np.float32)
-        radius2 = ((np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1) - truth.centre_px) ** 2).sum(-1)
+        radius2 = (
+            (np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1) - truth.centre_px) ** 2
+        ).sum(-1)
         radius2 /= (w**2 + h**2) / 4
         self._fall = (1 - imperfections.of("vignetting", _VIGNETTE) * radius2).astype(np.float32)
 

@@ -1,7 +1,7 @@
 """What the twin knows of a run and tells nobody but those who ask for the truth.
 
-    twin.jsonl   the first line is the twin itself: sample, seed, imperfections, sensor; then one
-                 line a session and one an exposure: its number, the true axes, the true power
+twin.jsonl   the first line is the twin itself: sample, seed, imperfections, sensor; then one
+             line a session and one an exposure: its number, the true axes, the true power
 """
 
 from __future__ import annotations
@@ -149,7 +149,9 @@ def _twin(path: Path, line: Mapping[str, Any]) -> Twin:
         entry = dict(line["twin"])
         return Twin(**{**entry, "without": tuple(entry["without"])})
     except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(path, f"the first line does not say which twin it was ({error!r})") from error
+        raise FormatError(
+            path, f"the first line does not say which twin it was ({error!r})"
+        ) from error
 
 
 def everything() -> tuple[str, ...]:

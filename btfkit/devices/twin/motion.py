@@ -60,7 +60,7 @@ class Profile:
             return 0.0
         if self.braking:
             return self.velocity - self.acceleration * (time_s - self.began_s)
-        ramp, peak = self._ramp()
+        _, peak = self._ramp()
         since, left = time_s - self.began_s, self.ends_s - time_s
         return min(peak, self.acceleration * since, self.acceleration * left)
 

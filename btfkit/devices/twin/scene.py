@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.devices.twin import layout
 from btfkit.devices.poses import Floats
+from btfkit.devices.twin import layout
 from btfkit.devices.twin.geometry import Placed, Truth
 from btfkit.devices.twin.holder import Plate
 from btfkit.devices.twin.imperfections import Imperfections
@@ -94,7 +94,8 @@ class Scene:
 
     def _shading(self, placed: Placed) -> Image:
         """(h, w, 2) over the plate: pi x radiance of a white Lambertian surface, and of the white
-        reference of reflectance 1."""
+        reference of reflectance 1.
+        """
         width, height = self._plate.size_mm
         w, h = round(width * self._per_mm), round(height * self._per_mm)
         x = (np.arange(w) + 0.5) / self._per_mm - width / 2
@@ -150,7 +151,9 @@ class Scene:
         light = to_lamp / np.sqrt(distance2)[:, None]
         view = to_camera / np.linalg.norm(to_camera, axis=-1, keepdims=True)
         h, w = self._relief.height.shape
-        place = (xy / (2 * half) * np.array([1, -1], np.float32) + np.float32(0.5)) * np.array([w, h], np.float32)
+        place = (xy / (2 * half) * np.array([1, -1], np.float32) + np.float32(0.5)) * np.array(
+            [w, h], np.float32
+        )
         traced = kernel.trace(
             self._relief, place - np.float32(0.5), light, view,
             np.zeros(len(xy), np.float32), samples=1,

@@ -80,7 +80,7 @@ class Sensor:
         warm = 2 ** ((temperature_c - _DARK_AT_C) / _DOUBLING_K)
         response = self._response if light.ndim == 2 else self._response[..., None]
         dark = self._dark if light.ndim == 2 else self._dark[..., None]
-        electrons = (light * response * np.float32(WHITE_E_PER_S) + dark * np.float32(warm))
+        electrons = light * response * np.float32(WHITE_E_PER_S) + dark * np.float32(warm)
         electrons = electrons * np.float32(exposure_s)
         if "shot-noise" in self._imperfections:
             electrons = _counted(electrons, rng)

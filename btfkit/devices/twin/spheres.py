@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from btfkit.devices.twin import layout
 from btfkit.devices.poses import Floats
+from btfkit.devices.twin import layout
 from btfkit.devices.twin.geometry import Placed
 from btfkit.devices.twin.lens import Lens
 
@@ -40,7 +40,9 @@ class Spheres:
             dark |= (miss * miss).sum(-1) < self._radius**2
         return dark
 
-    def seen(self, lens: Lens, placed: Placed, grid: int) -> list[tuple[slice, slice, Bools, Image]]:
+    def seen(
+        self, lens: Lens, placed: Placed, grid: int
+    ) -> list[tuple[slice, slice, Bools, Image]]:
         """Sub-pixels of each visible sphere: rows, columns, which are hit, mirrored ray there.
 
         Returns:
@@ -58,10 +60,16 @@ class Spheres:
             cols = _window(col, reach, grid, w)
             if rows.start >= rows.stop or cols.start >= cols.stop:
                 continue
-            ray = np.concatenate(
-                [lens.rays[rows, cols], np.ones((*lens.rays[rows, cols].shape[:2], 1), np.float32)],
-                axis=-1,
-            ) @ placed.rotation
+            ray = (
+                np.concatenate(
+                    [
+                        lens.rays[rows, cols],
+                        np.ones((*lens.rays[rows, cols].shape[:2], 1), np.float32),
+                    ],
+                    axis=-1,
+                )
+                @ placed.rotation
+            )
             ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
             to = centre - placed.camera
             along = ray @ to

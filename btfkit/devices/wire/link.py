@@ -40,7 +40,7 @@ class Transport(ABC):
         """The clock that time-outs are counted by, seconds."""
 
 
-class Refused(DeviceError):
+class RefusedError(DeviceError):
     """The firmware said no."""
 
     def __init__(self, what: str, refusal: Refusal, text: str) -> None:
@@ -68,7 +68,7 @@ class Link:
         """The payload of the reply.
 
         Raises:
-            Refused: the firmware does not do it.
+            RefusedError: the firmware does not do it.
             DeviceError: no reply, in several tries.
         """
         with self._turn:
@@ -151,7 +151,7 @@ class Link:
                 if packet.code != asked.code:
                     continue
                 if packet.kind is Kind.NAK:
-                    raise Refused(Command(asked.code).name.lower(), *parse_nak(packet.payload))
+                    raise RefusedError(Command(asked.code).name.lower(), *parse_nak(packet.payload))
                 if packet.kind in (Kind.ACK, Kind.DATA):
                     return packet.payload
             if not data:

@@ -79,7 +79,7 @@ class Hello(NamedTuple):
 
 
 class Status(NamedTuple):
-    """flags u32, source u32, clock f64, lamp f64, temperature f64, then an axis: encoder, counter."""
+    """flags u32, source u32, clock f64, lamp f64, temperature f64; an axis: encoder, counter."""
 
     state: State
     source: int
@@ -159,6 +159,7 @@ def expose(exposure_s: float, iso: float) -> bytes:
 
 
 def parse_expose(payload: bytes) -> tuple[float, float]:
+    """Seconds and ISO of an EXPOSE."""
     exposure_s, iso = _EXPOSE.unpack(payload)
     return exposure_s, iso
 
@@ -169,6 +170,7 @@ def read(frame: int, offset: int, size: int) -> bytes:
 
 
 def parse_read(payload: bytes) -> tuple[int, int, int]:
+    """Frame, offset and size of a READ."""
     frame, offset, size = _READ.unpack(payload)
     return frame, offset, size
 
@@ -179,6 +181,7 @@ def lamp(source: int) -> bytes:
 
 
 def parse_lamp(payload: bytes) -> int:
+    """Source of a LAMP."""
     return int(_SOURCE.unpack(payload)[0])
 
 
@@ -188,6 +191,7 @@ def nak(refusal: Refusal, text: str) -> bytes:
 
 
 def parse_nak(payload: bytes) -> tuple[Refusal, str]:
+    """Why, and in words; a code that this version does not know is UNKNOWN."""
     code = payload[0] if payload else 0
     known = code in {int(each) for each in Refusal}
     return Refusal(code) if known else Refusal.UNKNOWN, payload[1:].decode("utf-8", "replace")
