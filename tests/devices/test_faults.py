@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -10,6 +11,7 @@ import sys
 import pytest
 from runs import Killed, check_every_frame, run
 
+from btfkit.devices.capture.journal import Journal
 from btfkit.devices.faults import FAULTS, Faults
 from btfkit.errors import DeviceError
 from btfkit.sequence import Sequence
@@ -93,6 +95,27 @@ def test_replies_that_always_come_late_or_twice_slow_a_run_and_harm_it_not(name,
     assert run(tmp_path / "run", faults=faults, watch=watch).frames == FRAMES
     assert faults.struck[name] == 100
     assert check_every_frame(tmp_path / "run") == FRAMES
+
+
+def test_a_disk_that_is_full_when_the_journal_is_written_is_refused_and_resumed(
+    tmp_path, monkeypatch
+):
+    folder, left = tmp_path / "run", [40]
+    append = Journal.append
+
+    def full(journal, record):
+        left[0] -= 1
+        if left[0] < 0:
+            journal.tear(record)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        append(journal, record)
+
+    monkeypatch.setattr(Journal, "append", full)
+    with pytest.raises(DeviceError, match=r"journal\.jsonl cannot be written: No space left"):
+        run(folder)
+    monkeypatch.setattr(Journal, "append", append)
+    assert run(folder, resume=True).frames == FRAMES
+    assert check_every_frame(folder) == FRAMES
 
 
 @pytest.mark.parametrize("place", range(4))

@@ -89,7 +89,10 @@ class Folder:
         return self._journal.records
 
     def note(self, record: Mapping[str, Any]) -> None:
-        self._journal.append(record)
+        try:
+            self._journal.append(record)
+        except OSError as error:
+            raise _unwritten(self.path / NAME, error) from error
 
     def frame(self, name: str, image: NDArray[np.uint16], record: Mapping[str, Any]) -> None:
         """Write under a temporary name, sync, rename, then journal.
@@ -103,15 +106,12 @@ class Folder:
         try:
             self._write(self.path / name, data)
         except OSError as error:
-            raise DeviceError(
-                f"{self.path / name} cannot be written: {error.strerror}",
-                remedy="free some space, then start again with --resume",
-            ) from error
+            raise _unwritten(self.path / name, error) from error
         self._strike()
         if self._faults.strikes("kill"):
             self._journal.tear(whole)
             self._kill()
-        self._journal.append(whole)
+        self.note(whole)
 
     def image(self, name: str) -> NDArray[Any]:
         return counts.read(name, (self.path / name).read_bytes())
@@ -261,6 +261,13 @@ def rig_section(description: Mapping[str, Any]) -> dict[str, Any]:
         axes.append(entry)
     others = {key: description[key] for key in ("carries", "camera", "light")}
     return json.loads(json.dumps({"name": description.get("name", ""), "axes": axes, **others}))
+
+
+def _unwritten(path: Path, error: OSError) -> DeviceError:
+    return DeviceError(
+        f"{path} cannot be written: {error.strerror}",
+        remedy="free some space, then start again with --resume",
+    )
 
 
 def _killed() -> None:
