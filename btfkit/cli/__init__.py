@@ -9,6 +9,7 @@ import click
 
 # Verb -> module with a function of the verb's name, and the line that `btfkit --help` shows.
 VERBS: dict[str, tuple[str, str]] = {
+    "capture": ("btfkit.cli.capture", "Run a measurement on a rig, or on its twin."),
     "ingest": ("btfkit.cli.ingest", "Read any measured source into one native store."),
     "calibrate": ("btfkit.cli.calibrate", "Calibrate a sequence; find lights in photographs."),
     "convert": ("btfkit.cli.convert", "Write a store in an interchange format."),

@@ -30,6 +30,11 @@ class Bar:
         self._silent = quiet or not sys.stderr.isatty()
         self._drawn: Progress | None = None
 
+    @property
+    def silent(self) -> bool:
+        """Whether nothing may be drawn."""
+        return self._silent
+
     def __enter__(self) -> Bar:
         return self
 

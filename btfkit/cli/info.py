@@ -53,6 +53,7 @@ def installation() -> dict[str, Any]:
         "processors": os.cpu_count(),
         "threads": native.threads(),
         "cuda": _cuda(),
+        "devices": _devices(),
         "kernels": native.in_use(),
         "formats": list(FORMATS),
         "models": list(MODELS),
@@ -136,6 +137,20 @@ def _cuda() -> str:
     from btfkit.fitting import cuda_device
 
     return cuda_device()
+
+
+def _devices() -> list[str]:
+    """Rigs that `btfkit capture --device` can drive: those on the bus, and the twin."""
+    from btfkit.devices import DRIVERS, driver
+    from btfkit.errors import DeviceError
+
+    found: list[str] = []
+    for name in DRIVERS:
+        try:
+            found += [f"{name}:{rig.serial} ({rig.name})" for rig in driver(name).find()]
+        except DeviceError as error:
+            found.append(f"{name}: {error}")
+    return found
 
 
 def _listing(data: Mapping[str, Any], indent: str = "") -> str:

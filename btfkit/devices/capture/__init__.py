@@ -1,0 +1,1 @@
+"""The capture engine: a plan in, a sequence out, whatever happens in between."""

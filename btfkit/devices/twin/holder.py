@@ -1,0 +1,148 @@
+"""The holder of the twin: a plate with board, patches and white reference, drawn once."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit.devices.poses import Floats
+from btfkit.devices.twin import layout
+from btfkit.devices.twin.geometry import Truth
+
+Image = NDArray[np.float32]
+# Reflectance of ink, paper, mount and of what lies beyond the plate.
+_INK, _PAPER, _MOUNT, _CLOTH = 0.04, 0.85, 0.06, 0.015
+
+
+@final
+class Plate:
+    """Reflectance of the plate in its own plane, each texel the mean over its area.
+
+    Args:
+        target: section of the description. truth: how far things are displaced.
+        texels_per_mm: of the drawing.
+
+    Attributes:
+        drawing: (H, W, 4) linear sRGB, and how much of a texel is white reference.
+        size_mm: (width, height) of what is drawn.
+    """
+
+    def __init__(self, target: Mapping[str, Any], truth: Truth, texels_per_mm: float) -> None:
+        across, down = layout.BOARD
+        margin = 4 * layout.SQUARE_MM
+        self.size_mm = (
+            across * layout.SQUARE_MM + margin, down * layout.SQUARE_MM + margin
+        )  # fmt: skip
+        self._scale = texels_per_mm
+        self.drawing = _board_drawing(self.size_mm, texels_per_mm).copy()
+        half = layout.MOUNT_MM / 2
+        self._fill((-half, half), (-half, half), (_MOUNT,) * 3)
+        for patch, shift in zip(target["patches"], truth.displaced, strict=False):
+            self._patch(patch, shift)
+        self._patch(target["white"], truth.displaced[-1], white=1.0)
+
+    def texels(self, points: Image) -> Image:
+        """(..., 2) columns and rows of the drawing for x and y in mm."""
+        h, w = self.drawing.shape[:2]
+        scale = np.array([self._scale, -self._scale], np.float32)
+        return points * scale + np.array([w / 2 - 0.5, h / 2 - 0.5], np.float32)
+
+    def at(self, points: Image) -> Image:
+        """(h, w, 4) of the drawing at (h, w, 2) x and y in mm, between texels bilinear."""
+        where = self.texels(points)
+        return np.asarray(
+            cv2.remap(
+                self.drawing, where[..., 0], where[..., 1], cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_REPLICATE,
+            )
+        )  # fmt: skip
+
+    def _patch(self, entry: Mapping[str, Any], shift: Floats, *, white: float = 0.0) -> None:
+        (x, y), (w, h) = np.asarray(entry["centre_mm"][:2]) + shift, entry["size_mm"]
+        self._fill((x - w / 2, x + w / 2), (y - h / 2, y + h / 2), entry["reflectance"], white)
+
+    def _fill(
+        self,
+        x: tuple[float, float],
+        y: tuple[float, float],
+        reflectance: Sequence[float],
+        white: float = 0.0,
+    ) -> None:
+        _fill(self.drawing, self._scale, x, y, (*reflectance, white))
+
+
+@functools.lru_cache(maxsize=4)
+def _board_drawing(size_mm: tuple[float, float], texels_per_mm: float) -> Image:
+    """(H, W, 4) of cloth and board: thousands of modules, the same for every twin."""
+    w, h = (round(side * texels_per_mm) for side in size_mm)
+    drawing = np.zeros((h, w, 4), np.float32)
+    drawing[..., :3] = _CLOTH
+    across, down = layout.BOARD
+    left, top = -across * layout.SQUARE_MM / 2, down * layout.SQUARE_MM / 2
+    _fill(drawing, texels_per_mm, (left, -left), (-top, top), (_PAPER, _PAPER, _PAPER, 0.0))
+    for x, y, side, ink in board_cells():
+        level = _INK if ink else _PAPER
+        _fill(
+            drawing, texels_per_mm, (left + x, left + x + side), (top - y - side, top - y),
+            (level, level, level, 0.0),
+        )  # fmt: skip
+    return drawing
+
+
+def _fill(
+    drawing: Image,
+    scale: float,
+    x: tuple[float, float],
+    y: tuple[float, float],
+    value: Sequence[float],
+) -> None:
+    """Paint a rectangle; texels on its border get their share."""
+    h, w = drawing.shape[:2]
+    cols, across = _covered(w, x[0] * scale + w / 2, x[1] * scale + w / 2)
+    rows, down = _covered(h, h / 2 - y[1] * scale, h / 2 - y[0] * scale)
+    share = (down[:, None] * across)[..., None]
+    part = drawing[rows, cols]
+    part += share * (np.asarray(value, np.float32) - part)
+
+
+def board_cells() -> list[tuple[float, float, float, bool]]:
+    """Squares of the board, then modules of its markers: left, top, side (mm, y down), inked.
+
+    As OpenCV's CharucoBoard of the same numbers has them.
+    """
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, layout.DICTIONARY))
+    board = cv2.aruco.CharucoBoard(layout.BOARD, layout.SQUARE_MM, layout.MARKER_MM, dictionary)
+    across, down = layout.BOARD
+    modules = dictionary.markerSize + 2
+    marked = {}
+    for number, corners in zip(
+        np.asarray(board.getIds()).ravel(), board.getObjPoints(), strict=True
+    ):
+        left, top = (float(c) for c in np.asarray(corners)[0, :2])
+        marked[int(left / layout.SQUARE_MM), int(top / layout.SQUARE_MM)] = (number, left, top)
+    cells: list[tuple[float, float, float, bool]] = []
+    for j in range(down):
+        for i in range(across):
+            ink = (i, j) not in marked
+            cells.append((i * layout.SQUARE_MM, j * layout.SQUARE_MM, layout.SQUARE_MM, ink))
+    side = layout.MARKER_MM / modules
+    for number, left, top in marked.values():
+        bits = dictionary.generateImageMarker(int(number), modules, borderBits=1)
+        for row in range(modules):
+            for col in range(modules):
+                if bits[row, col] == 0:
+                    cells.append((left + col * side, top + row * side, side, True))  # noqa: PERF401
+    return cells
+
+
+def _covered(count: int, low: float, high: float) -> tuple[slice, Image]:
+    """Texels that an interval touches, and the share of each that it covers."""
+    first, last = max(int(np.floor(low)), 0), min(int(np.ceil(high)), count)
+    edges = np.arange(first, last)
+    share = np.minimum(edges + 1, high) - np.maximum(edges, low)
+    return slice(first, last), np.asarray(np.clip(share, 0, 1), np.float32)
