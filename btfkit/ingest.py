@@ -17,7 +17,7 @@ from btfkit import io
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.files import refuse_existing
-from btfkit.io import archive
+from btfkit.io import listing
 from btfkit.io.store import reader as store
 from btfkit.io.store import writer
 
@@ -135,7 +135,7 @@ def source_hash(source: Path) -> dict[str, Any]:
     """
     digest = hashlib.sha256()
     if source.is_dir():
-        files = sorted(archive.names_of(source))
+        files = sorted(listing.names_of(source))
         for name in files:
             entry = f"{name}\0{(source / name).stat().st_size}\n"
             digest.update(entry.encode("utf-8", "surrogateescape"))

@@ -410,3 +410,36 @@ def white(size: tuple[int, int]) -> bytes:
     file = BytesIO()
     Image.fromarray(np.full((*size, 3), 255, "u1")).save(file, "PNG")
     return file.getvalue()
+
+
+def packed_tiff(
+    values: np.ndarray, bits: int, photometric: int, table: np.ndarray | None = None
+) -> bytes:
+    """A TIFF of samples (h, w, c) of 1 to 14 bits, as scanners and machine vision write them.
+
+    Args:
+        values: whole numbers.
+        bits: of a sample; rows are filled up to whole bytes.
+        photometric: 0 white is zero, 1 black is zero, 2 RGB, 3 palette.
+        table: (3, 2^bits) colours of a palette.
+    """
+    h, w, c = values.shape
+    spread = (values.reshape(h, -1)[..., None] >> np.arange(bits - 1, -1, -1)) & 1
+    body = b"".join(np.packbits(row.reshape(-1)).tobytes() for row in spread.astype("u1"))
+    body += bytes(len(body) % 2)
+    entries = [(256, 4, w), (257, 4, h), (259, 3, 1), (262, 3, photometric), (273, 4, 8), (277, 3, c), (278, 4, h), (279, 4, len(body))]  # fmt: skip
+    longer = {258: struct.pack(f"<{c}H", *[bits] * c)}
+    if table is not None:
+        longer[320] = table.astype("<u2").tobytes()
+    at = 8 + len(body)
+    beyond = at + 2 + 12 * (len(entries) + len(longer)) + 4
+    rows = {tag: struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in entries}
+    tail = b""
+    for tag, data in longer.items():
+        where = struct.pack("<I", beyond + len(tail)) if len(data) > 4 else data.ljust(4, b"\0")
+        rows[tag] = struct.pack("<HHI", tag, 3, len(data) // 2) + where
+        tail += data if len(data) > 4 else b""
+    directory = (
+        struct.pack("<H", len(rows)) + b"".join(rows[tag] for tag in sorted(rows)) + bytes(4)
+    )
+    return b"II*\0" + struct.pack("<I", at) + body + directory + tail

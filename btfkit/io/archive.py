@@ -8,7 +8,7 @@ import stat
 import threading
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import Any, final
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.errors import FormatError
-from btfkit.io import numerals, spelling
+from btfkit.io import listing, numerals, spelling
 from btfkit.io.images import is_image
 
 # One member of more bytes than this is no image of a sample.
@@ -25,9 +25,6 @@ _MOST_BYTES = 1 << 31
 _MOST_RATIO = 200
 # A manifest of 300 000 images.
 MOST_TEXT = 1 << 26
-_BYTE_ORDER_MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
-# General purpose bit 11 of a zip: names are UTF-8.
-_UTF8 = 1 << 11
 
 
 @final
@@ -65,7 +62,7 @@ class Archive:
         """All members, sorted."""
         if self._zip:
             return sorted(self._infos)
-        return sorted(_files(self.path))
+        return sorted(listing.files_of(self.path))
 
     def __contains__(self, name: str) -> bool:
         return self._member(name) is not None
@@ -133,7 +130,7 @@ class Archive:
             raise FormatError(self.path / name, f"{size} bytes of text; at most {MOST_TEXT}")
         data = self.read(member)
         try:
-            return decoded(data)
+            return listing.decoded(data)
         except ValueError as error:
             raise FormatError(self.path / name, "not a text file") from error
 
@@ -238,7 +235,7 @@ class Archive:
                 self.path, f"not a readable zip ({error})", remedy="copy the archive again"
             ) from error
         for info in members:
-            plain = _zip_name(info).replace("\\", "/")
+            plain = listing.zip_name(info).replace("\\", "/")
             name = PurePosixPath(plain)
             # ZipInfo.is_dir fails on an empty name.
             if plain[-1:] in ("", "/") or not spelling.all_count(name):
@@ -278,92 +275,9 @@ class Archive:
         return file
 
 
-def decoded(data: bytes, errors: str = "strict") -> str:
-    """Text of bytes: UTF-16 where it starts with its mark, UTF-8, or else Latin-1.
-
-    Raises:
-        ValueError: binary.
-    """
-    if data[:2] in _BYTE_ORDER_MARKS:
-        return data.decode(_BYTE_ORDER_MARKS[data[:2]], errors)
-    if b"\0" in data:
-        raise ValueError("binary")
-    try:
-        return data.decode("utf-8-sig", errors)
-    except UnicodeDecodeError:
-        return data.decode("latin-1")
-
-
-def names_of(path: Path) -> list[str]:
-    """Names of members without checking them: for `detect`. Empty for a damaged zip."""
-    if path.is_dir():
-        return list(_files(path))
-    try:
-        if zipfile.is_zipfile(path):
-            with zipfile.ZipFile(path) as file:
-                names = [_zip_name(info).replace("\\", "/") for info in file.infolist()]
-            return [name for name in names if spelling.all_count(PurePosixPath(name))]
-    except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError):
-        return []
-    return []
-
-
-def folder_with(names: list[str], *required: str) -> str | None:
-    """The folder of a listing that holds all the `required` files; the highest of several."""
-    folders: dict[PurePosixPath, set[str]] = {}
-    for name in names:
-        path = PurePosixPath(name.replace("\\", "/"))
-        folders.setdefault(path.parent, set()).add(spelling.key(path.name))
-    wanted = {spelling.key(name) for name in required}
-    found = [folder for folder, files in folders.items() if wanted <= files]
-    if not found:
-        return None
-    best = min(found, key=lambda folder: (len(folder.parts), str(folder)))
-    return "" if best == PurePosixPath(".") else str(best)
-
-
 def _grouped(names: list[str], by: Callable[[str], str]) -> dict[str, list[str]]:
     """Names by some part of their keys."""
     groups: dict[str, list[str]] = {}
     for name in names:
         groups.setdefault(by(spelling.key(name)), []).append(name)
     return groups
-
-
-def _zip_name(info: zipfile.ZipInfo) -> str:
-    """The name of a member; where nothing is said of its encoding, UTF-8 if it is that.
-
-    Python takes it for code page 437, which macOS never writes.
-    """
-    if info.flag_bits & _UTF8:
-        return info.filename
-    try:
-        return info.filename.encode("cp437").decode("utf-8")
-    except UnicodeError:
-        return info.filename
-
-
-def _files(folder: Path) -> Iterator[str]:
-    """Relative names of all files below a folder, links to files included, those to folders not.
-
-    What lies behind a link to a folder inside is listed where it lies. Hidden files, litter and
-    stores are left out. The disk is asked for listings alone, not about each of 20 000 images.
-    """
-    pending = [""]
-    while pending:
-        base = pending.pop()
-        with os.scandir(folder / base) as entries:
-            for entry in entries:
-                if not spelling.counts(entry.name):
-                    continue
-                if entry.is_dir(follow_symlinks=False):
-                    pending.append(f"{base}{entry.name}/")
-                elif _is_file(entry):
-                    yield base + entry.name
-
-
-def _is_file(entry: os.DirEntry[str]) -> bool:
-    try:
-        return entry.is_file()
-    except OSError:  # a link that leads to itself
-        return False

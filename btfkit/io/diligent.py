@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
-from btfkit.io import archive as archives
-from btfkit.io import named
+from btfkit.io import listing, named
 from btfkit.io.archive import Archive
 from btfkit.io.images.masks import read_mask
 from btfkit.io.lp import y_sign
@@ -30,7 +29,7 @@ _REQUIRED = ("light_directions.txt", "light_intensities.txt", "filenames.txt")
 
 def detect(path: Path) -> bool:
     """Whether a folder or zip holds the three text files; names only."""
-    return archives.folder_with(archives.names_of(path), *_REQUIRED) is not None
+    return listing.folder_with(listing.names_of(path), *_REQUIRED) is not None
 
 
 def read(
@@ -58,7 +57,7 @@ def read(
         scale=(None, "relative: 1 is the brightest code value under a light of intensity 1"),
     )
     holder = Archive(path)
-    base = archives.folder_with(holder.names, *_REQUIRED)
+    base = listing.folder_with(holder.names, *_REQUIRED)
     if base is None:
         raise FormatError(path, f"lacks one of {', '.join(_REQUIRED)}")
     folder = PurePosixPath(base)

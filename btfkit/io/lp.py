@@ -18,8 +18,7 @@ import numpy as np
 
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
-from btfkit.io import archive as archives
-from btfkit.io import named, numerals
+from btfkit.io import listing, named, numerals
 from btfkit.io.archive import Archive
 
 _SHORTEST = 1e-4
@@ -29,7 +28,7 @@ def detect(path: Path) -> bool:
     """Whether it is an .lp file, or a folder or zip with one; names only."""
     if path.is_file() and path.suffix.lower() == ".lp":
         return True
-    return bool(_light_files(archives.names_of(path)))
+    return bool(_light_files(listing.names_of(path)))
 
 
 def read(

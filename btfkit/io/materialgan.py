@@ -19,8 +19,7 @@ import numpy as np
 
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
-from btfkit.io import archive as archives
-from btfkit.io import images, named
+from btfkit.io import images, listing, named
 from btfkit.io.archive import Archive
 from btfkit.nearfield import PointLight
 from btfkit.textures import Array
@@ -31,7 +30,7 @@ _MM_PER_CM = 10.0
 
 def detect(path: Path) -> bool:
     """Whether a folder or zip holds the three text files; names only."""
-    return archives.folder_with(archives.names_of(path), *_REQUIRED) is not None
+    return listing.folder_with(listing.names_of(path), *_REQUIRED) is not None
 
 
 def read(path: Path, *, transfer: str | None = None, cosine: str | None = None) -> BTF:
@@ -46,7 +45,7 @@ def read(path: Path, *, transfer: str | None = None, cosine: str | None = None) 
         FormatError: damaged, or not as many positions as images.
     """
     holder = Archive(path)
-    base = archives.folder_with(holder.names, *_REQUIRED)
+    base = listing.folder_with(holder.names, *_REQUIRED)
     if base is None:
         raise FormatError(path, f"lacks one of {', '.join(_REQUIRED)}")
     folder = PurePosixPath(base)

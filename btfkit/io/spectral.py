@@ -18,7 +18,7 @@ import numpy as np
 
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
-from btfkit.io import anglenames, archive, images, named
+from btfkit.io import anglenames, images, listing, named
 from btfkit.io.archive import Archive
 from btfkit.io.images import Image
 
@@ -35,7 +35,7 @@ _SHORTEST_NM, _LONGEST_NM = 100, 20000
 
 def detect(path: Path) -> bool:
     """Whether EXRs named by angles have wavelengths for channels; reads a header."""
-    names = [n for n in archive.names_of(path) if PurePosixPath(n).suffix.lower() in SUFFIXES]
+    names = [n for n in listing.names_of(path) if PurePosixPath(n).suffix.lower() in SUFFIXES]
     for name in [n for n in names if anglenames.is_named(n)][:_LOOKS]:
         try:
             return bool(wavelengths(name, images.exr_channels(name, _bytes(path, name))))

@@ -18,7 +18,7 @@ import numpy as np
 from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.files import whole_folder
-from btfkit.io import archive, images, named
+from btfkit.io import images, listing, named
 from btfkit.io.anglenames import Angles
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".hdr"}
@@ -26,7 +26,7 @@ SUFFIXES = {".jpg", ".jpeg", ".png", ".hdr"}
 
 def detect(path: Path) -> bool:
     """Whether images named `... tl000 pl000 tv000 pv000.*` lie in a folder or zip; names only."""
-    return named.looks_named(archive.names_of(path), SUFFIXES, spaces=True)
+    return named.looks_named(listing.names_of(path), SUFFIXES, spaces=True)
 
 
 def read(

@@ -20,7 +20,7 @@ from btfkit import colour, directions
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.files import whole_folder
-from btfkit.io import archive, images, named
+from btfkit.io import images, listing, named
 from btfkit.io.archive import Archive
 from btfkit.io.images import Image, exr
 from btfkit.io.images.profiles import CIE_XYZ
@@ -31,7 +31,7 @@ SUFFIXES = {".png", ".exr", ".jpg", ".jpeg"}
 
 def detect(path: Path) -> bool:
     """Whether images named `tl000_pl000_tv000_pv000.*` lie in a folder or zip; names only."""
-    return named.looks_named(archive.names_of(path), SUFFIXES, spaces=False)
+    return named.looks_named(listing.names_of(path), SUFFIXES, spaces=False)
 
 
 def read(

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from btfkit.errors import FormatError
-from btfkit.io import archive
-from btfkit.io.archive import Archive, folder_with
+from btfkit.io import listing
+from btfkit.io.archive import Archive
+from btfkit.io.listing import folder_with
 from btfkit.io.spelling import inside
 
 
@@ -111,8 +112,8 @@ def test_an_encrypted_member_is_refused(tmp_path: Path) -> None:
 
 def test_detection_of_damaged_zips_sees_nothing(tmp_path: Path) -> None:
     (tmp_path / "x.zip").write_bytes(b"PK\x03\x04" + bytes(100))
-    assert archive.names_of(tmp_path / "x.zip") == []
-    assert archive.names_of(tmp_path / "nothing") == []
+    assert listing.names_of(tmp_path / "x.zip") == []
+    assert listing.names_of(tmp_path / "nothing") == []
 
 
 @pytest.mark.parametrize(

@@ -292,6 +292,20 @@ def test_a_jpeg_that_is_cut_short_is_refused() -> None:
             images.read("a.jpg", data[:size], transfer="srgb")
 
 
+def test_what_lies_between_or_behind_the_segments_of_a_jpeg_changes_nothing() -> None:
+    data = images.encode_jpeg(np.random.default_rng(0).random((32, 32, 3), np.float32))
+    plain = images.read("a.jpg", data, transfer="srgb")
+    at = data.index(b"\xff\xdb")
+    note = b"\xff\xfe\x00\x08\xff\xd9\xff\xd8ab"
+    for other in (
+        data[:at] + bytes(5) + data[at:],
+        data[:at] + note + data[at:],
+        data + b"MotionPhoto_Data" + bytes(range(256)) * 30,
+        data + data[: len(data) // 2],
+    ):
+        np.testing.assert_array_equal(images.read("a.jpg", other, transfer="srgb"), plain)
+
+
 def test_a_png_that_is_cut_short_or_has_a_flipped_bit_is_refused() -> None:
     data = images.encode_png(np.random.default_rng(0).random((32, 32, 3), np.float32))
     images.read("a.png", data, transfer="srgb")

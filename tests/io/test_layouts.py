@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from io import BytesIO
 
 import numpy as np
 import pictures
@@ -10,8 +11,10 @@ import pytest
 from hypothesis import HealthCheck, assume, given, note, settings
 from hypothesis import strategies as st
 from onepicture import READERS
+from PIL import Image
 
 import btfkit
+from btfkit.errors import FormatError
 from btfkit.io import images
 
 KINDS = {
@@ -43,6 +46,40 @@ def test_a_picture_of_any_layout_is_what_its_writer_meant(kind: str, data: st.Da
     compared(made, image.linear)
     if image.alpha is not None:
         assert image.alpha.shape == image.linear.shape[:2]
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4, 8, 10, 12, 14])
+@pytest.mark.parametrize("kind", ["white is zero", "black is zero", "RGB", "palette"])
+def test_samples_of_any_bits_are_shares_of_their_highest_code(kind: str, bits: int) -> None:
+    top = (1 << bits) - 1
+    rng = np.random.default_rng(bits)
+    values = rng.integers(0, top, (7, 9, 3 if kind == "RGB" else 1), endpoint=True)
+    values[0, 0], values[0, 1] = 0, top
+    table = rng.integers(0, 65535, (3, top + 1), endpoint=True) if kind == "palette" else None
+    photometric = ["white is zero", "black is zero", "RGB", "palette"].index(kind)
+    data = pictures.packed_tiff(values, bits, photometric, table)
+    if kind == "palette" and bits > 8:
+        with pytest.raises(FormatError):
+            images.read("a.tif", data, transfer="linear")
+        return
+    truth = values / top
+    if kind == "white is zero":
+        truth = 1 - truth
+    if table is not None:
+        truth = (table / 65535).T[values[..., 0]]
+    # 10 to 14 bits are decoded as 16.
+    np.testing.assert_allclose(images.read("a.tif", data, transfer="linear"), truth, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "how", ["raw", "tiff_lzw", "packbits", "tiff_adobe_deflate", "tiff_deflate"]
+)
+def test_lossless_compressions_of_tiff_change_nothing(how: str) -> None:
+    codes = np.random.default_rng(0).integers(0, 255, (16, 20, 3), endpoint=True).astype("u1")
+    file = BytesIO()
+    Image.fromarray(codes).save(file, "TIFF", compression=how)
+    found = images.read("a.tif", file.getvalue(), transfer="linear")
+    np.testing.assert_allclose(found, codes / 255, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import PurePosixPath
 
 from btfkit.io.images import codes, exr, radiance
-from btfkit.io.images.encoding import encode_jpeg, encode_png
-from btfkit.io.images.exr import exr_channels, read_exr, write_exr
+from btfkit.io.images.encoding import encode_jpeg, encode_png, write_exr
+from btfkit.io.images.exr import exr_channels, read_exr
 from btfkit.io.images.image import Array, Image
 
 __all__ = [

@@ -1,9 +1,11 @@
-"""Pictures to bytes: 8-bit sRGB JPEG and PNG, and profiles put into what others encoded."""
+"""Pictures to files: 8-bit sRGB JPEG and PNG, EXR, TIFF, and profiles put into what is encoded."""
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 from btfkit import colour
 from btfkit.io.images.image import Array
 from btfkit.io.images.libraries import opencv, openimageio
+from btfkit.io.images.profiles import Chromaticities
 
 _MOST_SEGMENT = 65535 - 2 - 14
 
@@ -51,6 +54,46 @@ def jpeg_with_profile(data: bytes, profile: bytes) -> bytes:
     if data[2:4] == b"\xff\xe0":
         at = 4 + struct.unpack_from(">H", data, 4)[0]
     return data[:at] + segments + data[at:]
+
+
+def write_exr(
+    path: str | os.PathLike[str],
+    values: NDArray[Any],
+    channels: Sequence[str],
+    attributes: Mapping[str, Any] | None = None,
+    *,
+    chromaticities: Chromaticities | None = None,
+) -> None:
+    """Write (h, w, c) as an EXR, half or float32 by the dtype of `values`, compressed losslessly.
+
+    Args:
+        path: of the file.
+        values: (h, w, c).
+        channels: their names.
+        attributes: numbers and texts.
+        chromaticities: of R, G and B, so that other programs need not guess; None says nothing.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    oiio = openimageio()
+    half = values.dtype == np.float16
+    h, w, c = values.shape
+    spec = oiio.ImageSpec(w, h, c, oiio.HALF if half else oiio.FLOAT)
+    spec.channelnames = tuple(channels)
+    spec.attribute("compression", "zip")
+    if chromaticities is not None:
+        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), chromaticities)
+    for key, value in (attributes or {}).items():
+        spec.attribute(key, value)
+    out = oiio.ImageOutput.create(os.fspath(path))
+    if out is None or not out.open(os.fspath(path), spec):
+        raise OSError(f"{os.fspath(path)}: cannot be written ({oiio.geterror()})")
+    done = out.write_image(np.ascontiguousarray(values))
+    fault = out.geterror()
+    # Closing writes the line offsets: a full disk shows here at the latest.
+    if not (out.close() and done):
+        raise OSError(f"{os.fspath(path)}: cannot be written ({fault or oiio.geterror()})")
 
 
 def write_tiff(

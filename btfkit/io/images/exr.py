@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from btfkit.errors import FormatError
 from btfkit.io.images import exif
@@ -290,43 +288,3 @@ def _in_display_window(name: str, pixels: Array, spec: Any, coded: int) -> Array
     if inside.size:
         out[top : top + inside.shape[0], left : left + inside.shape[1]] = inside
     return out
-
-
-def write_exr(
-    path: str | os.PathLike[str],
-    values: NDArray[Any],
-    channels: Sequence[str],
-    attributes: Mapping[str, Any] | None = None,
-    *,
-    chromaticities: Chromaticities | None = None,
-) -> None:
-    """Write (h, w, c) as an EXR, half or float32 by the dtype of `values`, compressed losslessly.
-
-    Args:
-        path: of the file.
-        values: (h, w, c).
-        channels: their names.
-        attributes: numbers and texts.
-        chromaticities: of R, G and B, so that other programs need not guess; None says nothing.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    oiio = openimageio()
-    half = values.dtype == np.float16
-    h, w, c = values.shape
-    spec = oiio.ImageSpec(w, h, c, oiio.HALF if half else oiio.FLOAT)
-    spec.channelnames = tuple(channels)
-    spec.attribute("compression", "zip")
-    if chromaticities is not None:
-        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), chromaticities)
-    for key, value in (attributes or {}).items():
-        spec.attribute(key, value)
-    out = oiio.ImageOutput.create(os.fspath(path))
-    if out is None or not out.open(os.fspath(path), spec):
-        raise OSError(f"{os.fspath(path)}: cannot be written ({oiio.geterror()})")
-    done = out.write_image(np.ascontiguousarray(values))
-    fault = out.geterror()
-    # Closing writes the line offsets: a full disk shows here at the latest.
-    if not (out.close() and done):
-        raise OSError(f"{os.fspath(path)}: cannot be written ({fault or oiio.geterror()})")

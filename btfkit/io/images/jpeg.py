@@ -108,10 +108,9 @@ def _declared(
 
 
 def _next(data: bytes, at: int) -> tuple[int, int]:
-    """The marker at `at`, and where its body starts."""
-    fill, marker = struct.unpack_from("BB", data, at)
-    if fill != 0xFF:
-        raise ValueError("no marker")
+    """The next marker from `at` on, and where its body starts; bytes that are none are padding."""
+    at = data.index(b"\xff", at)
+    (marker,) = struct.unpack_from("B", data, at + 1)
     while marker == 0xFF:
         at += 1
         (marker,) = struct.unpack_from("B", data, at + 1)

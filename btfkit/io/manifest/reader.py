@@ -23,7 +23,7 @@ from btfkit.btf import BTF, QUANTITY
 from btfkit.errors import FormatError
 from btfkit.files import whole_folder
 from btfkit.io import archive as archives
-from btfkit.io import images
+from btfkit.io import images, listing
 from btfkit.io.archive import Archive
 from btfkit.io.manifest import assembly, poses
 from btfkit.textures import Array, as_textures
@@ -41,11 +41,11 @@ def detect(path: Path) -> bool:
         with path.open("rb") as file:
             start = file.read(4096)
         try:
-            return bool(poses.csv_columns(archives.decoded(start, "replace")))
+            return bool(poses.csv_columns(listing.decoded(start, "replace")))
         except ValueError:
             return False
-    names = archives.names_of(path)
-    return any(archives.folder_with(names, name) is not None for name in NAMES)
+    names = listing.names_of(path)
+    return any(listing.folder_with(names, name) is not None for name in NAMES)
 
 
 def read(
@@ -171,7 +171,7 @@ def _found(path: Path) -> tuple[Archive, str]:
         return Archive(path.parent), path.name
     holder = Archive(path)
     for name in NAMES:
-        base = archives.folder_with(holder.names, name)
+        base = listing.folder_with(holder.names, name)
         if base is not None:
             return holder, str(PurePosixPath(base) / name)
     raise FormatError(path, f"holds no {' or '.join(NAMES)}")
