@@ -266,7 +266,11 @@ def test_the_bar_names_its_part_and_the_time_of_the_whole(monkeypatch: pytest.Mo
         bar.phase("training", left_s=78)
         assert bar.clock() == "0:12 of 1:30"
         assert bar._drawn is not None
-        assert bar._drawn.tasks[0].description == "fit: training"
+        (task,) = bar._drawn.tasks
+        assert (task.description, task.total) == ("fit: training", None)
+        bar(3, 1000)
+        assert (task := bar._drawn.tasks[0]).completed == 3
+        assert task.total == 1000
 
 
 # --- interruptions
