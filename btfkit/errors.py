@@ -69,5 +69,5 @@ def meaning(name: str, known: Iterable[str]) -> str:
     """` (did you mean ...?)` where a known name is close; empty where none is."""
     import difflib
 
-    close = difflib.get_close_matches(name.lower(), list(known), n=1, cutoff=0.6)
+    close = difflib.get_close_matches(name.lower(), list(known), n=1, cutoff=0.7)
     return f" (did you mean {close[0]}?)" if close else ""

@@ -189,6 +189,11 @@ class QuerySet:
     def __len__(self) -> int:
         return len(self.uv)
 
+    def __repr__(self) -> str:
+        """Short: how many, and what comes with them."""
+        known = [name for name in _ROWS[3:] if getattr(self, name) is not None]
+        return f"QuerySet({len(self)} queries{', with ' if known else ''}{', '.join(known)})"
+
     def valid(self) -> NDArray[np.bool_]:
         """(b,) rows that are finite throughout and not seen from below the horizon."""
         keep = (self.view[:, 2] >= 0) & (np.linalg.norm(self.light, axis=1) > 0)

@@ -58,9 +58,9 @@ class Bar:
         if left_s is not None:
             self._whole_s = time.monotonic() - self._start + left_s
         if self._ready() and self._drawn:
-            self._drawn.reset(
-                self._drawn.task_ids[0], total=None, description=f"{self._name}: {name}"
-            )
+            # A task cannot forget its total.
+            self._drawn.remove_task(self._drawn.task_ids[0])
+            self._drawn.add_task(f"{self._name}: {name}", total=None)
 
     def clock(self) -> str:
         """Time since the start and, where it is known, of the whole: `0:12 of 0:30`."""

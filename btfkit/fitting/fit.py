@@ -6,33 +6,29 @@ import importlib
 import importlib.metadata
 import math
 import os
-import secrets
-import tempfile
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from btfkit.btf import BTF
 from btfkit.errors import FitError, unknown
-from btfkit.files import refuse_existing, room_for
-from btfkit.fitting import CLOSED_FORM, MODELS, TRAINED
+from btfkit.files import refuse_existing
+from btfkit.fitting import CLOSED_FORM, MODELS
 from btfkit.fitting.phases import Phases, Told
 from btfkit.fitting.reading import masked, read_once
-from btfkit.fitting.report import FitReport, report_file
+from btfkit.fitting.report import FitReport
+from btfkit.fitting.saving import report_file, save, state_file
+from btfkit.fitting.training import Plan, Progress, Ran, gpu, solved, trained
 from btfkit.heldout import fingerprint, split
-from btfkit.materials import file
 from btfkit.materials.base import Material
 from btfkit.materials.evaluation import errors_on_btf, errors_on_queries
 from btfkit.queries import QuerySet
 from btfkit.relief.relief import Relief
 from btfkit.settings import as_text
 
-Progress = Callable[[int, int], None]
 _DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -82,9 +78,9 @@ def fit(
         OSError: nothing can be written where `out` shall lie.
     """
     _check(model, budget_s, steps, device)
-    split(2, holdout, seed)
+    split(1, holdout, seed)  # refuses what is no share
     final = _out(out, resume=resume, force=force)
-    plan = _Plan(steps, final, resume, force or resume, seed, holdout, device)
+    plan = Plan(steps, final, resume, force or resume, seed, holdout, device)
     phases = Phases(budget_s if steps is None else None, phase)
     phases.begin("reading")
     data = read_once(_traced(source))
@@ -92,9 +88,9 @@ def fit(
     given = {**parts, **as_text(settings or {})}
     if chosen in CLOSED_FORM:
         train = split(len(data), holdout, seed)[0]
-        material, run = _solved(data.subset(train), chosen, given, plan, progress)
+        material, run = solved(data.subset(train), chosen, given, plan, progress)
     else:
-        material, run = _trained(data, chosen, given, plan, phases, progress)
+        material, run = trained(data, chosen, given, plan, phases, progress)
     if phases.late():
         said = f"starting took {phases.seconds['starting']:.0f} s of a budget of {budget_s:g} s"
         choice = (*choice, f"{said}: training had its least share, and ended late")
@@ -106,7 +102,7 @@ def fit(
     if final is not None:
         # Before the evaluation: whatever happens there, the model is safe.
         phases.begin("writing")
-        _save(material, final, run.training, force=plan.force)
+        save(material, final, run.training, force=plan.force)
     phases.begin("evaluating")
     errors: Mapping[str, Any] = {}
     try:
@@ -119,7 +115,7 @@ def fit(
     if final is not None:
         report.write(report_file(final))
         if not run.interrupted:
-            _state_file(final).unlink(missing_ok=True)
+            state_file(final).unlink(missing_ok=True)
     return report
 
 
@@ -146,7 +142,7 @@ def _out(out: str | os.PathLike[str] | None, *, resume: bool, force: bool) -> Pa
         if resume:
             raise FitError("nothing to resume: no out is named", remedy="name it with out")
         return None
-    state = _state_file(Path(out))
+    state = state_file(Path(out))
     if resume and not state.is_file():
         raise FitError(f"nothing to resume: {state} is not there", remedy="leave out --resume")
     # What an interruption wrote is there to be replaced by what goes on with it.
@@ -159,145 +155,11 @@ def _out(out: str | os.PathLike[str] | None, *, resume: bool, force: bool) -> Pa
     return final
 
 
-@final
-@dataclass(frozen=True)
-class _Ran:
-    """What a training took."""
-
-    seconds: float
-    cpu_seconds: float
-    steps: int
-    queries: int
-    curve: tuple[tuple[float, int, float], ...] = ()
-    interrupted: bool = False
-    training: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    device: str = "cpu"
-    untrained: tuple[str, ...] = ()
-
-
-@final
-@dataclass(frozen=True)
-class _Plan:
-    """What is asked of a fit, once it has been checked."""
-
-    steps: int | None
-    out: Path | None
-    resume: bool
-    force: bool
-    seed: int
-    holdout: float
-    device: str
-
-
-def _solved(
-    source: BTF | QuerySet,
-    model: str,
-    settings: Mapping[str, str],
-    plan: _Plan,
-    progress: Progress | None,
-) -> tuple[Material, _Ran]:
-    """A closed form, which reads its data as it goes."""
-    if plan.resume:
-        raise FitError(f"nothing to resume: {model} is solved at once", remedy="leave out --resume")
-    if plan.out is not None and model == "interpolation":
-        room_for(plan.out, 2 * _values(source), what="an interpolation of these data")
-    start, cpu = time.perf_counter(), time.process_time()
-    function = _load(CLOSED_FORM[model])
-    material: Material = function(source, settings=settings, progress=progress)
-    seconds = time.perf_counter() - start, time.process_time() - cpu
-    return material, _Ran(*seconds, 1, _samples(source))
-
-
-def _trained(
-    source: BTF | QuerySet,
-    model: str,
-    settings: Mapping[str, str],
-    plan: _Plan,
-    phases: Phases,
-    progress: Progress | None,
-) -> tuple[Material, _Ran]:
-    import torch
-
-    from btfkit import native
-    from btfkit.fitting import loop
-
-    if plan.device == "cuda" and not _gpu():
-        raise FitError("no CUDA device is available", remedy="use --device cpu")
-    torch.set_num_threads(native.threads())
-    generators = loop.Generators(plan.seed)
-    if isinstance(source, QuerySet):
-        phases.begin("starting")
-    train, test = split(len(source), plan.holdout, plan.seed)
-    trainable: loop.Trainable = _load(TRAINED[model])(
-        source, train, test, settings=settings, generators=generators,
-        progress=phases.reading(progress),
-    )  # fmt: skip
-    where = "cpu"
-    if plan.device != "cpu" and _gpu() and (moved := trainable.on_device(_gpu())):
-        trainable, where = moved, _gpu()
-    run = loop.Run(None, plan.steps)
-    state, best = None if plan.out is None else _state_file(plan.out), None
-    if state is not None:
-        held = sum(tensor.nbytes for tensor in trainable.state().values())
-        # The present state, the best one, and the model itself.
-        room_for(state, 3 * held, what="what a fit can be resumed from")
-        if plan.resume:
-            best = loop.load_state(state, trainable, run, generators)
-    phases.begin("training")
-    if plan.steps is None:
-        run.budget_s = phases.training_s()
-    loop.train(
-        trainable, run, generators=generators, state_file=state, progress=progress, best=best
-    )
-    if run.interrupted and state is not None and run.done == 0:
-        raise KeyboardInterrupt
-    ran = _Ran(
-        run.elapsed_s, run.cpu_s, run.done, trainable.queries, tuple(run.curve),
-        run.interrupted, trainable.training_arrays(), where, trainable.untrained(),
-    )  # fmt: skip
-    return trainable.material(), ran
-
-
-def _save(
-    material: Material, out: Path, training: Mapping[str, NDArray[Any]], *, force: bool
-) -> None:
-    """Write the model; where that fails, write it elsewhere and say where."""
-    try:
-        file.save(material, out, training=training, force=force)
-    except OSError as error:
-        kept = _saved_elsewhere(material, out, training)
-        if kept is None:
-            raise
-        raise OSError(
-            error.errno, f"{error.strerror or error}; what was trained is kept as {kept}", str(out)
-        ) from error
-
-
-def _saved_elsewhere(
-    material: Material, out: Path, training: Mapping[str, NDArray[Any]]
-) -> Path | None:
-    for folder in (Path.cwd(), Path.home(), Path(tempfile.gettempdir())):
-        kept = folder / f"{out.stem}.{secrets.token_hex(4)}.safetensors"
-        try:
-            file.save(material, kept, training=training)
-        except (OSError, RuntimeError):
-            continue
-        return kept
-    return None
-
-
-def _gpu() -> str:
-    """torch's name of the GPU; empty without one."""
-    import torch
-
-    return "cuda" if torch.cuda.is_available() else ""
-
-
 def _cpu_alone(model: str, used: str, device: str) -> bool:
     """Whether a GPU was asked for, or is there, and the model cannot use it."""
     if model in CLOSED_FORM:
         return device == "cuda"
-    return used == "cpu" and device != "cpu" and bool(_gpu())
+    return used == "cpu" and device != "cpu" and bool(gpu())
 
 
 def _traced(source: BTF | QuerySet | Relief) -> BTF | QuerySet:
@@ -320,25 +182,8 @@ def _chosen(source: BTF | QuerySet, model: str) -> tuple[str, tuple[str, ...], M
     return choice.model, choice.reasons, choice.settings
 
 
-def _samples(source: BTF | QuerySet) -> int:
-    return len(source) * (math.prod(source.shape[1:3]) if isinstance(source, BTF) else 1)
-
-
-def _values(source: BTF | QuerySet) -> int:
-    return math.prod(source.shape) if isinstance(source, BTF) else 0
-
-
-def _load(home: str) -> Any:
-    module, name = home.split(":")
-    return getattr(importlib.import_module(module), name)
-
-
-def _state_file(out: Path) -> Path:
-    return out.with_name(out.name + ".state")
-
-
 def _provenance(
-    source: BTF | QuerySet, plan: _Plan, settings: Mapping[str, str], run: _Ran
+    source: BTF | QuerySet, plan: Plan, settings: Mapping[str, str], run: Ran
 ) -> dict[str, Any]:
     found = {
         "data": dict(source.provenance),
@@ -355,7 +200,7 @@ def _provenance(
 def _errors(
     material: Material,
     source: BTF | QuerySet,
-    plan: _Plan,
+    plan: Plan,
     limit_s: float | None,
     progress: Progress | None,
 ) -> Mapping[str, Any]:
@@ -374,8 +219,8 @@ def _report(
     material: Material,
     errors: Mapping[str, Any],
     source: BTF | QuerySet,
-    plan: _Plan,
-    run: _Ran,
+    plan: Plan,
+    run: Ran,
     phases: Phases,
 ) -> FitReport:
     train, test = split(len(source), plan.holdout, plan.seed)

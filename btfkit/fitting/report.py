@@ -91,8 +91,3 @@ class FitReport:
         pairs, of = self.errors.get("pairs"), self.errors.get("of_pairs")
         some = f" ({pairs} of {of} pairs)" if pairs != of else ""
         return f"held-out PSNR {psnr:.2f} dB{some}"
-
-
-def report_file(out: Path) -> Path:
-    """Where the report of a model file lies."""
-    return out.with_name(out.name.removesuffix(".safetensors") + ".report.json")

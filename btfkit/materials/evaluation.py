@@ -16,6 +16,11 @@ from btfkit.footprint import level_of
 from btfkit.materials.base import Material
 from btfkit.queries import QuerySet
 
+Window = tuple[slice, slice]
+Picture = tuple[NDArray[np.float32], NDArray[np.float32]]
+# Texels a side that stand for a large texture where time is short.
+_WINDOW = 256
+
 
 def texel_centres(h: int, w: int) -> NDArray[np.float64]:
     """(h, w, 2) uv of the centres of a grid of texels."""
@@ -23,13 +28,16 @@ def texel_centres(h: int, w: int) -> NDArray[np.float64]:
     return np.stack([u, v], axis=-1)
 
 
-def answer_pair(material: Material, btf: BTF, index: int) -> NDArray[np.float32]:
-    """(h, w, c) what a material answers for every texel of pair `index` of a BTF."""
+def answer_pair(
+    material: Material, btf: BTF, index: int, window: Window | None = None
+) -> NDArray[np.float32]:
+    """(h, w, c) what a material answers for every texel of pair `index`, or for a window of it."""
     _, h, w, _ = btf.shape
+    at = window or (slice(None), slice(None))
     near = btf.light_position is not None or btf.view_position is not None
-    light = btf.light_at(index) if near else btf.light[index]
-    view = btf.view_at(index) if near else btf.view[index]
-    return material.evaluate(texel_centres(h, w), light, view).reflectance
+    light = btf.light_at(index)[at] if near else btf.light[index]
+    view = btf.view_at(index)[at] if near else btf.view[index]
+    return material.evaluate(texel_centres(h, w)[at], light, view).reflectance
 
 
 def errors_on_btf(
@@ -46,14 +54,15 @@ def errors_on_btf(
         material: what answers.
         btf: what was measured.
         pairs: indices of the pairs to compare, in this order; None takes all.
-        within_s: seconds after which no further pair is taken; at least one is. None takes all.
+        within_s: seconds after which no further pair is taken; at least one is, and of large
+            textures a window at random stands for each. None takes all of everything.
         progress: called with (per mille done, 1000).
 
     Returns:
         mse, psnr, mse_log1p, psnr_log1p, mae, psnr_srgb (pooled over all texels), ssim_srgb and
         flip (means over pairs), mean_psnr (mean over pairs of each pair's own, but of
         `exact_pairs`, whose own is infinite; None where no other is left), pairs that were
-        compared, of_pairs, masked.
+        compared, of_pairs, masked; where windows were compared, `window`, its height and width.
 
     Raises:
         ValueError: channels differ, or nothing is measured.
@@ -63,25 +72,53 @@ def errors_on_btf(
             f"the model answers channels {material.header.channels}; the BTF has {btf.channels}"
         )
     chosen = np.arange(len(btf)) if pairs is None else np.asarray(pairs, np.intp)
-    answers = (answer_pair(material, btf, int(pair)) for pair in chosen)
-    return errors_of_pictures(answers, btf, pairs=chosen, within_s=within_s, progress=progress)
+    windows = _windows(btf, len(chosen)) if within_s is not None else None
+    pictures = (
+        _seen(material, btf, int(pair), None if windows is None else windows[k])
+        for k, pair in enumerate(chosen)
+    )
+    found = _errors_of(pictures, len(chosen), within_s, progress)
+    if windows is not None:
+        found["window"] = [_WINDOW if side > _WINDOW else side for side in btf.shape[1:3]]
+    return found
 
 
-def errors_of_pictures(
-    answers: Iterable[NDArray[np.float32]],
-    btf: BTF,
-    *,
-    pairs: ArrayLike | None = None,
-    within_s: float | None = None,
-    progress: Callable[[int, int], None] | None = None,
+def errors_of_pictures(answers: Iterable[NDArray[np.float32]], btf: BTF) -> dict[str, Any]:
+    """The same of answers (h, w, c) that are given, one for every pair of a BTF."""
+    truths = (btf.texture(pair) for pair in range(len(btf)))
+    return _errors_of(zip(answers, truths, strict=True), len(btf), None, None)
+
+
+def _windows(btf: BTF, count: int) -> list[Window] | None:
+    """A window at random for each of `count` textures; None where textures are small."""
+    if max(btf.shape[1:3]) <= _WINDOW:
+        return None
+    rng = np.random.default_rng(0)
+    sides = btf.shape[1:3]
+    starts = [rng.integers(max(side - _WINDOW, 0) + 1, size=count).tolist() for side in sides]
+    return [
+        (slice(row, row + _WINDOW), slice(col, col + _WINDOW))
+        for row, col in zip(*starts, strict=True)
+    ]
+
+
+def _seen(material: Material, btf: BTF, pair: int, window: Window | None) -> Picture:
+    """Answer and truth of a pair, or of a window of it."""
+    truth = btf.texture(pair)
+    return answer_pair(material, btf, pair, window), truth if window is None else truth[window]
+
+
+def _errors_of(
+    pictures: Iterable[Picture],
+    count: int,
+    within_s: float | None,
+    progress: Callable[[int, int], None] | None,
 ) -> dict[str, Any]:
-    """The same of answers (h, w, c) that are given, one a pair; options as in `errors_on_btf`."""
-    chosen = np.arange(len(btf)) if pairs is None else np.asarray(pairs, np.intp)
+    """Errors of answers against truths, of as many of `count` as there is time for."""
     pooled, pictured = metrics.Pooled(), metrics.Pictured()
     own: list[float] = []
     start, done = time.perf_counter(), 0
-    for pair, answer in zip(chosen, answers, strict=True):
-        truth = btf.texture(int(pair))
+    for answer, truth in pictures:
         pooled.add(answer, truth)
         pictured.add(answer, truth)
         measured = np.isfinite(truth)
@@ -89,8 +126,7 @@ def errors_of_pictures(
             own.append(metrics.psnr(float(np.square(answer - truth)[measured].mean())))
         done += 1
         spent = time.perf_counter() - start
-        share = done / len(chosen) if within_s is None else max(
-            done / len(chosen), min(spent / within_s, 1.0))  # fmt: skip
+        share = done / count if within_s is None else max(done / count, min(spent / within_s, 1))
         if progress:
             progress(int(1000 * share), 1000)
         # Another pair takes about as long as those before.
@@ -103,7 +139,7 @@ def errors_of_pictures(
         "mean_psnr": float(np.mean(finite)) if finite else None,
         "exact_pairs": len(own) - len(finite),
         "pairs": done,
-        "of_pairs": len(chosen),
+        "of_pairs": count,
         "masked": pooled.masked,
     }
 

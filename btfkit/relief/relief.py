@@ -84,6 +84,12 @@ class Relief:
                     f"{name} ranges {value.min():g}..{value.max():g}; expected 0.02..1"
                 )
 
+    def __repr__(self) -> str:
+        """Short: sizes, and how far it reaches."""
+        h, w = self.size
+        low, high = float(self.height.min()), float(self.height.max())
+        return f"Relief({w} x {h} texels, {self.wrap}, heights {low:.3g} to {high:.3g} tile widths)"
+
     @property
     def size(self) -> tuple[int, int]:
         """(h, w)."""

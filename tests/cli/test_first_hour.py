@@ -32,6 +32,7 @@ from btfkit.io import queryfile
 from btfkit.io.store import writer
 from btfkit.materials import evaluation, file
 from btfkit.queries import QuerySet
+from btfkit.relief import procedural
 from btfkit.textures import Textures
 
 QUICK = ("--set", "pairs=4", "--set", "texels=64")
@@ -201,6 +202,21 @@ def test_an_evaluation_ends_in_its_time_and_says_of_how_many_pairs() -> None:
     assert told[-1] == (1000, 1000)
 
 
+def test_large_textures_are_told_by_windows_where_time_is_short(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(evaluation, "_WINDOW", 8)
+    btf = sample()
+    material = fit(btf, model="lambert").material
+    short = evaluation.errors_on_btf(material, btf, within_s=60)
+    whole = evaluation.errors_on_btf(material, btf)
+    assert (short["window"], short["pairs"]) == ([8, 8], 40)
+    assert "window" not in whole
+    # A quarter of the texels of each of 40 pairs: the same to a few per cent.
+    assert short["mse"] == pytest.approx(whole["mse"], rel=0.1)
+    assert short["mse"] != whole["mse"]
+
+
 @pytest.mark.parametrize(("more", "pairs"), [((), 1), (("--full-report",), 8)])
 def test_a_full_report_is_of_all_held_out_pairs(
     more: tuple[str, ...], pairs: int, here: Path, monkeypatch: pytest.MonkeyPatch,
@@ -250,7 +266,11 @@ def test_the_bar_names_its_part_and_the_time_of_the_whole(monkeypatch: pytest.Mo
         bar.phase("training", left_s=78)
         assert bar.clock() == "0:12 of 1:30"
         assert bar._drawn is not None
-        assert bar._drawn.tasks[0].description == "fit: training"
+        (task,) = bar._drawn.tasks
+        assert (task.description, task.total) == ("fit: training", None)
+        bar(3, 1000)
+        assert (task := bar._drawn.tasks[0]).completed == 3
+        assert task.total == 1000
 
 
 # --- interruptions
@@ -357,7 +377,7 @@ def never(*_: Any, **__: Any) -> None:
 def test_a_missing_folder_is_found_before_training(
     model: str, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("btfkit.fitting.fit._load", never)
+    monkeypatch.setattr("btfkit.fitting.training._load", never)
     assert run(command, ["fit", "--model", model, "-o", "no/where.safetensors"]) == 1
     assert "no is not a folder; create it first" in capsys.readouterr().err
 
@@ -457,6 +477,10 @@ def test_python_checks_what_the_command_line_checks(options: dict[str, Any], mes
         btfkit.fit(sample(), **options)
 
 
+def test_most_of_the_pairs_may_be_held_out() -> None:
+    assert len(btfkit.fit(sample(), model="lambert", holdout=0.9).held_out) == 36
+
+
 def test_settings_may_be_numbers_in_python() -> None:
     report = btfkit.fit(sample(), model="pca", settings={"rank": 3})
     assert report.settings == {"rank": "3"}
@@ -479,6 +503,10 @@ def test_reports_and_materials_say_themselves_in_a_line() -> None:
     for value in (report, report.material, sample()):
         assert len(repr(value)) < 300
     assert "40 textures of 16 x 16, 3 channels" in repr(sample())
+    up = np.tile(np.float32([0, 0, 1]), (5, 1))
+    rows = QuerySet(np.full((5, 2), 0.5), up, up, rgb=up)
+    assert repr(rows) == "QuerySet(5 queries, with rgb)"
+    assert repr(procedural.make("print", 8)).startswith("Relief(8 x 8 texels, wrap, heights ")
     assert "Lambert(16 x 16" in repr(report.material)
 
 

@@ -1,0 +1,145 @@
+"""The part of a fit in which the model comes about: solved at once, or trained by steps."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, final
+
+from numpy.typing import NDArray
+
+from btfkit.btf import BTF
+from btfkit.errors import FitError
+from btfkit.files import room_for
+from btfkit.fitting import CLOSED_FORM, TRAINED
+from btfkit.fitting.phases import Phases
+from btfkit.fitting.saving import state_file
+from btfkit.heldout import split
+from btfkit.materials.base import Material
+from btfkit.queries import QuerySet
+
+Progress = Callable[[int, int], None]
+
+
+@final
+@dataclass(frozen=True)
+class Ran:
+    """What a training took."""
+
+    seconds: float
+    cpu_seconds: float
+    steps: int
+    queries: int
+    curve: tuple[tuple[float, int, float], ...] = ()
+    interrupted: bool = False
+    training: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    device: str = "cpu"
+    untrained: tuple[str, ...] = ()
+
+
+@final
+@dataclass(frozen=True)
+class Plan:
+    """What is asked of a fit, once it has been checked."""
+
+    steps: int | None
+    out: Path | None
+    resume: bool
+    force: bool
+    seed: int
+    holdout: float
+    device: str
+
+
+def solved(
+    source: BTF | QuerySet,
+    model: str,
+    settings: Mapping[str, str],
+    plan: Plan,
+    progress: Progress | None,
+) -> tuple[Material, Ran]:
+    """A closed form, which reads its data as it goes."""
+    if plan.resume:
+        raise FitError(f"nothing to resume: {model} is solved at once", remedy="leave out --resume")
+    if plan.out is not None and model == "interpolation":
+        room_for(plan.out, 2 * _values(source), what="an interpolation of these data")
+    start, cpu = time.perf_counter(), time.process_time()
+    function = _load(CLOSED_FORM[model])
+    material: Material = function(source, settings=settings, progress=progress)
+    seconds = time.perf_counter() - start, time.process_time() - cpu
+    return material, Ran(*seconds, 1, _samples(source))
+
+
+def trained(
+    source: BTF | QuerySet,
+    model: str,
+    settings: Mapping[str, str],
+    plan: Plan,
+    phases: Phases,
+    progress: Progress | None,
+) -> tuple[Material, Ran]:
+    """A model trained by steps, until they or the budget are spent, or Ctrl-C ends it."""
+    import torch
+
+    from btfkit import native
+    from btfkit.fitting import loop
+
+    if plan.device == "cuda" and not gpu():
+        raise FitError("no CUDA device is available", remedy="use --device cpu")
+    torch.set_num_threads(native.threads())
+    generators = loop.Generators(plan.seed)
+    if isinstance(source, QuerySet):
+        phases.begin("starting")
+    train, test = split(len(source), plan.holdout, plan.seed)
+    trainable: loop.Trainable = _load(TRAINED[model])(
+        source, train, test, settings=settings, generators=generators,
+        progress=phases.reading(progress),
+    )  # fmt: skip
+    where = "cpu"
+    if plan.device != "cpu" and gpu() and (moved := trainable.on_device(gpu())):
+        trainable, where = moved, gpu()
+    run = loop.Run(None, plan.steps)
+    state, best = None if plan.out is None else state_file(plan.out), None
+    if state is not None:
+        held = sum(tensor.nbytes for tensor in trainable.state().values())
+        # The present state, the best one, and the model itself.
+        room_for(state, 3 * held, what="what a fit can be resumed from")
+        if plan.resume:
+            best = loop.load_state(state, trainable, run, generators)
+    phases.begin("training")
+    if plan.steps is None:
+        run.budget_s = phases.training_s()
+    loop.train(
+        trainable, run, generators=generators, state_file=state, progress=progress, best=best
+    )
+    if run.interrupted and state is not None and run.done == 0:
+        raise KeyboardInterrupt
+    ran = Ran(
+        run.elapsed_s, run.cpu_s, run.done, trainable.queries, tuple(run.curve),
+        run.interrupted, trainable.training_arrays(), where, trainable.untrained(),
+    )  # fmt: skip
+    return trainable.material(), ran
+
+
+def gpu() -> str:
+    """torch's name of the GPU; empty without one."""
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else ""
+
+
+def _samples(source: BTF | QuerySet) -> int:
+    return len(source) * (math.prod(source.shape[1:3]) if isinstance(source, BTF) else 1)
+
+
+def _values(source: BTF | QuerySet) -> int:
+    return math.prod(source.shape) if isinstance(source, BTF) else 0
+
+
+def _load(home: str) -> Any:
+    module, name = home.split(":")
+    return getattr(importlib.import_module(module), name)
