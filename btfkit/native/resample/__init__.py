@@ -223,7 +223,9 @@ def _empty(image: Array, texels: int, sites: NDArray[np.int32] | None) -> list[A
     return [np.empty((texels, channels), np.float32) for _ in range(3)]
 
 
-def _given(image: Array, variance: Array | None, sites: Any, place: Any, shape: Any) -> tuple[Any, ...]:
+def _given(
+    image: Array, variance: Array | None, sites: Any, place: Any, shape: Any
+) -> tuple[Any, ...]:
     none = np.empty(0, np.float32)
     return (
         np.ascontiguousarray(image, np.float32),
