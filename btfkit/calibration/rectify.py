@@ -225,5 +225,5 @@ def _inverse(matrix: Floats) -> Floats:
         return np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], -2) * det[..., None, None]
 
 
-def _packed(matrix: Floats) -> Array:
+def _packed(matrix: NDArray[np.floating]) -> Array:
     return np.stack([matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]], -1).astype(np.float32)

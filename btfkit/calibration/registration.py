@@ -154,7 +154,7 @@ def _frequencies(shape: tuple[int, ...]) -> tuple[Floats, Floats]:
     """(h, 1) and (1, w) angular frequencies, the one at Nyquist left out: it has no sign."""
     out = []
     for size in shape:
-        frequency = 2 * np.pi * np.fft.fftfreq(size)
+        frequency = np.asarray(2 * np.pi * np.fft.fftfreq(size), np.float64)
         if size % 2 == 0:
             frequency[size // 2] = 0
         out.append(frequency)

@@ -1,8 +1,8 @@
-"""Cameras, boards and rigs: estimated from frames of a small simulation with its own code."""
+"""Cameras, boards and turntables: estimated from frames of a small simulation with its own code."""
 
 import numpy as np
 import pytest
-import rigs
+import turntables
 import torch
 from kornia.geometry.calibration import distort_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
@@ -17,8 +17,8 @@ from btfkit.calibration.kinematics import Axis, Kinematics, Rigid
 from btfkit.calibration.mirrors import highlight
 from btfkit.errors import CalibrationError
 
-CAMERA = Camera(rigs.WIDTH, rigs.HEIGHT, rigs.TRUTH)
-BOARD = Board(rigs.SQUARES, rigs.SQUARE, rigs.MARKER)
+CAMERA = Camera(turntables.WIDTH, turntables.HEIGHT, turntables.TRUTH)
+BOARD = Board(turntables.SQUARES, turntables.SQUARE, turntables.MARKER)
 GUESS = np.array([1450.0, 1450, 499.5, 374.5, 0, 0, 0, 0, 0])
 
 
@@ -30,11 +30,11 @@ def nominal(rig, camera=None, spheres=True):
     """The rig as drawn: what a calibration starts from."""
     axes = tuple(Axis(name, "rotary", *line) for name, line in rig.nominal.items())
     kinematics = Kinematics(axes, {"sample": ("tilt", "turn"), "light": ("arm",)})
-    near = {"lamp": rigs.LIGHT + [20.0, -10, 15]}
-    some = rigs.SPHERES + [0.5, -0.7, 0.4] if spheres else np.zeros((0, 3))
+    near = {"lamp": turntables.LIGHT + [20.0, -10, 15]}
+    some = turntables.SPHERES + [0.5, -0.7, 0.4] if spheres else np.zeros((0, 3))
     return Geometry(
-        camera or Camera(rigs.WIDTH, rigs.HEIGHT, GUESS), rigid(rig.nominal_camera), kinematics,
-        Rigid.identity(), some, np.full(len(some), rigs.RADIUS), near if spheres else {},
+        camera or Camera(turntables.WIDTH, turntables.HEIGHT, GUESS), rigid(rig.nominal_camera), kinematics,
+        Rigid.identity(), some, np.full(len(some), turntables.RADIUS), near if spheres else {},
     )  # fmt: skip
 
 
@@ -49,29 +49,29 @@ def readings(k, count=16, widest=72.0):
 
 
 def sightings(rig, views, noise, rng):
-    points = rigs.corners()
+    points = turntables.corners()
     out = []
     for k, at in enumerate(views):
-        pixels = rigs.project(rigs.apply(rig.sample_to_camera(at["tilt"], at["turn"]), points))
+        pixels = turntables.project(turntables.apply(rig.sample_to_camera(at["tilt"], at["turn"]), points))
         out.append(
             Sighting(f"view {k}", at, points, pixels + noise * rng.standard_normal(pixels.shape))
         )
     return out
 
 
-def sphere_sightings(rig, views, rng, *, spheres=rigs.SPHERES, noise=(0.1, 0.05)):
+def sphere_sightings(rig, views, rng, *, spheres=turntables.SPHERES, noise=(0.1, 0.05)):
     """Outlines and highlights with the noise of an ellipse fit and of a centroid, px."""
     out = []
     for k, at in enumerate(views):
         to_camera = rig.sample_to_camera(at["tilt"], at["turn"])
-        light = rigs.apply(
-            rig.camera, rigs.apply(rigs.turn(*rig.true["arm"], at["arm"]), rigs.LIGHT)
+        light = turntables.apply(
+            rig.camera, turntables.apply(turntables.turn(*rig.true["arm"], at["arm"]), turntables.LIGHT)
         )
-        for s, centre in enumerate(rigs.apply(to_camera, spheres)):
-            outline = rigs.sphere_outline(centre, rigs.RADIUS, 24) + noise[0] * rng.standard_normal(
+        for s, centre in enumerate(turntables.apply(to_camera, spheres)):
+            outline = turntables.sphere_outline(centre, turntables.RADIUS, 24) + noise[0] * rng.standard_normal(
                 (24, 2)
             )
-            spot = rigs.sphere_highlight(centre, rigs.RADIUS, light) + noise[
+            spot = turntables.sphere_highlight(centre, turntables.RADIUS, light) + noise[
                 1
             ] * rng.standard_normal(2)
             out.append(SphereSighting(f"view {k}", at, s, outline, {"lamp": spot}))
@@ -87,7 +87,7 @@ def test_the_camera_agrees_with_the_plain_simulation_and_comes_back_from_its_pix
     points = np.stack([*rng.uniform(-60, 60, (2, 200)), rng.uniform(200, 300, 200)], -1)
     pixels = CAMERA.project(points)
     # float64 throughout: pixels of 1e3 keep 1e-12 of themselves
-    np.testing.assert_allclose(pixels, rigs.project(points), atol=1e-9)
+    np.testing.assert_allclose(pixels, turntables.project(points), atol=1e-9)
     np.testing.assert_allclose(CAMERA.rays(pixels), points / points[:, 2:], atol=1e-12)
 
 
@@ -112,7 +112,7 @@ def test_projection_and_its_derivatives_are_those_of_kornia():
         plane = points[:, :2] / points[:, 2:] * parameters[:2] + parameters[2:4]
         return distort_points(plane[None], matrix[None], parameters[None, 4:])[0]
 
-    given = torch.tensor(points), torch.tensor(rigs.TRUTH)
+    given = torch.tensor(points), torch.tensor(turntables.TRUTH)
     pixels, by_point, by_parameter = CAMERA.project_with_derivatives(points)
     expected = projected(*given)
     jacobians = torch.autograd.functional.jacobian(projected, given)
@@ -124,14 +124,14 @@ def test_projection_and_its_derivatives_are_those_of_kornia():
 
 def test_derivatives_of_a_tilting_turning_sample_and_the_optimum_are_those_of_automatic_differentiation():
     rng = np.random.default_rng(3)
-    rig = rigs.Turntable(rng)
+    rig = turntables.Turntable(rng)
     views = [readings(k, 6) for k in range(6)]
     seen = sightings(rig, views, 0.02, rng)
     start = nominal(rig, spheres=False)
     found = adjust(start, seen)
     # The same rig in torch: everything that `found` left free, straight from Rodrigues' formula.
     pixels = torch.tensor(np.stack([s.pixels for s in seen]))
-    points = torch.tensor(rigs.corners())
+    points = torch.tensor(turntables.corners())
     angles = torch.tensor([[v["tilt"], v["turn"]] for v in views])
 
     def residuals(lens, pose, lines):
@@ -190,7 +190,7 @@ def test_derivatives_of_every_parameter_of_a_rig_with_spheres_are_differences_of
     slip_sd,
 ):
     rng = np.random.default_rng(4)
-    rig = rigs.Turntable(rng)
+    rig = turntables.Turntable(rng)
     views = [readings(k, 4) for k in range(4)]
     problem = Problem(
         nominal(rig),
@@ -219,26 +219,26 @@ def test_a_mirror_sphere_shows_a_light_where_the_way_over_it_is_shortest():
         point = highlight(centre[None], light[None], np.array([5.0]))[0]
         # Nelder-Mead leaves 1e-6 px
         np.testing.assert_allclose(
-            CAMERA.project(point), rigs.sphere_highlight(centre, 5.0, light), atol=1e-4
+            CAMERA.project(point), turntables.sphere_highlight(centre, 5.0, light), atol=1e-4
         )
 
 
 def test_the_pattern_of_a_board_is_the_one_that_opencv_prints():
-    picture = rigs.board_picture()
+    picture = turntables.board_picture()
     rows, columns = np.mgrid[: picture.shape[0], : picture.shape[1]] + 0.5
-    scale = 40 / rigs.SQUARE
-    width, height = (n * rigs.SQUARE for n in rigs.SQUARES)
+    scale = 40 / turntables.SQUARE
+    width, height = (n * turntables.SQUARE for n in turntables.SQUARES)
     assert (BOARD.pattern(columns / scale - width / 2, height / 2 - rows / scale) == picture).all()
-    np.testing.assert_allclose(BOARD.corners_mm, rigs.corners(), atol=1e-9)
+    np.testing.assert_allclose(BOARD.corners_mm, turntables.corners(), atol=1e-9)
 
 
 @pytest.fixture(scope="module")
 def measured():
     """Sixteen rendered views to 72 degrees, and what a calibration makes of them."""
     rng = np.random.default_rng(6)
-    rig = rigs.Turntable(rng)
+    rig = turntables.Turntable(rng)
     views = [readings(k) for k in range(16)]
-    images = [rigs.board_frame(rig.sample_to_camera(v["tilt"], v["turn"]), rng) for v in views]
+    images = [turntables.board_frame(rig.sample_to_camera(v["tilt"], v["turn"]), rng) for v in views]
     single = calibrate_camera(images, BOARD)
     seen = [
         Sighting(f"view {k}", views[k], BOARD.corners_mm[view.numbers], view.pixels)
@@ -254,15 +254,15 @@ def test_a_rig_is_calibrated_from_sixteen_rendered_views_to_72_degrees(measured)
     rig, single, found = measured
     # The pinhole alone, before the axes: OpenCV by itself leaves 0.2 px and 0.13 %.
     assert single.residual_px < 0.03
-    focal = found.geometry.camera.parameters[0] / rigs.TRUTH[0]
+    focal = found.geometry.camera.parameters[0] / turntables.TRUTH[0]
     assert abs(focal - 1) < 1e-4
-    points = rigs.corners()
+    points = turntables.corners()
     for tilt, angle in zip(
         np.radians([0, 20, 40, 55, 65, 72]), np.radians([33, 111, 200, 290, 350, 77]), strict=True
     ):
         at = {"tilt": tilt, "turn": angle, "arm": 0.3}
         to_camera = rig.sample_to_camera(tilt, angle)
-        true = rigs.project(rigs.apply(to_camera, points))
+        true = turntables.project(turntables.apply(to_camera, points))
         off = found.geometry.camera.project(found.geometry.sample_to_camera(at)(points)) - true
         assert np.sqrt((off**2).sum(1).mean()) <= 0.03, (
             f"held out view at {np.degrees(tilt):.0f} deg"
@@ -270,7 +270,7 @@ def test_a_rig_is_calibrated_from_sixteen_rendered_views_to_72_degrees(measured)
         view = found.geometry.view_position(at)
         assert angle_deg(view, rig.view_direction(tilt, angle)) < 0.02
         light = found.geometry.light_position("lamp", at)
-        assert angle_deg(light, rig.light_direction(rigs.LIGHT, tilt, angle, 0.3)) < 0.05
+        assert angle_deg(light, rig.light_direction(turntables.LIGHT, tilt, angle, 0.3)) < 0.05
     assert not {
         name for name in found.held if name.startswith(("axis.tilt", "axis.turn", "camera.f"))
     }
@@ -283,8 +283,8 @@ def test_corners_fitted_with_the_boards_picture_are_good_to_a_hundredth_of_a_pix
     rig, single, _ = measured
     for k, view in enumerate(single.views):
         at = readings(k)
-        true = rigs.project(
-            rigs.apply(rig.sample_to_camera(at["tilt"], at["turn"]), rigs.corners())
+        true = turntables.project(
+            turntables.apply(rig.sample_to_camera(at["tilt"], at["turn"]), turntables.corners())
         )
         off = view.pixels - true[view.numbers]
         # noise 0.004 of a contrast of 0.75; the simulation's nine samples a pixel leave the rest
@@ -294,7 +294,7 @@ def test_corners_fitted_with_the_boards_picture_are_good_to_a_hundredth_of_a_pix
 
 def test_gauge_freedom_is_named_and_held_and_the_rest_is_found():
     rng = np.random.default_rng(7)
-    rig = rigs.Turntable(rng)
+    rig = turntables.Turntable(rng)
     views = [readings(k) for k in range(16)]
     found = adjust(nominal(rig, spheres=False), sightings(rig, views, 0.01, rng))
     assert [n for n in found.held if n.startswith("board_to_sample")] == [
@@ -305,30 +305,30 @@ def test_gauge_freedom_is_named_and_held_and_the_rest_is_found():
     assert not any(n.startswith(("axis.tilt", "axis.turn", "camera_pose")) for n in found.held)
     np.testing.assert_array_equal(found.geometry.board.rotation, np.eye(3))
     assert 1 < found.condition < 1e7
-    error = found.geometry.camera.parameters[0] - rigs.TRUTH[0]
+    error = found.geometry.camera.parameters[0] - turntables.TRUTH[0]
     assert abs(error) < 4 * found.sd("camera.fx")
 
 
 def test_points_of_the_sample_itself_tell_where_the_board_sits():
     rng = np.random.default_rng(8)
-    rig = rigs.Turntable(rng)
+    rig = turntables.Turntable(rng)
     views = [readings(k) for k in range(16)]
     marks = np.array([[-30.0, -20, 0], [30, -20, 0], [30, 20, 0], [-30, 20, 0], [0, 0, 1.5]])
-    off = rigs.turn([0, 0, 1], np.zeros(3), 0.01)
+    off = turntables.turn([0, 0, 1], np.zeros(3), 0.01)
     off[:3, 3] = 0.4, -0.3, 0.2
     seen = []
     for k, at in enumerate(views):
         to_camera = rig.sample_to_camera(at["tilt"], at["turn"])
-        on_board = rigs.project(rigs.apply(to_camera @ off, rigs.corners()))
+        on_board = turntables.project(turntables.apply(to_camera @ off, turntables.corners()))
         seen.append(
             Sighting(
                 f"view {k}",
                 at,
-                rigs.corners(),
+                turntables.corners(),
                 on_board + 0.01 * rng.standard_normal(on_board.shape),
             )
         )
-        on_sample = rigs.project(rigs.apply(to_camera, marks))
+        on_sample = turntables.project(turntables.apply(to_camera, marks))
         seen.append(
             Sighting(
                 f"view {k}", at, marks, on_sample + 0.02 * rng.standard_normal((5, 2)), on="sample"
@@ -344,7 +344,7 @@ def test_points_of_the_sample_itself_tell_where_the_board_sits():
 
 def test_nearly_parallel_views_hold_what_they_cannot_tell_and_name_it():
     rng = np.random.default_rng(9)
-    rig = rigs.Turntable(rng)
+    rig = turntables.Turntable(rng)
     views = [readings(k, widest=0.2) for k in range(16)]
     found = adjust(nominal(rig, spheres=False), sightings(rig, views, 0.02, rng))
     assert any(name in found.held for name in ("camera.fx", "camera.fy", "camera_pose.shift.z"))
@@ -354,11 +354,11 @@ def test_nearly_parallel_views_hold_what_they_cannot_tell_and_name_it():
 
 def test_parallel_views_of_a_free_camera_are_refused(monkeypatch):
     rng = np.random.default_rng(10)
-    rig = rigs.Turntable(rng)
+    rig = turntables.Turntable(rng)
     poses = [rig.sample_to_camera(np.radians(k), np.radians(40 * k)) for k in range(3)]
-    pixels = iter([rigs.project(rigs.apply(pose, rigs.corners())) for pose in poses])
+    pixels = iter([turntables.project(turntables.apply(pose, turntables.corners())) for pose in poses])
     monkeypatch.setattr(Board, "detect", lambda self, image: (np.arange(48), next(pixels)))
-    blank = [np.zeros((rigs.HEIGHT, rigs.WIDTH))] * 3
+    blank = [np.zeros((turntables.HEIGHT, turntables.WIDTH))] * 3
     with pytest.raises(
         CalibrationError, match=r"within .* degrees of parallel in all 3 views.*tilted"
     ):
@@ -370,7 +370,7 @@ def test_frames_without_a_board_are_refused_with_their_number():
     with pytest.raises(CalibrationError, match=r"seen in 0 of 4 frames; at least 3 are needed"):
         calibrate_camera(blank, BOARD)
     with pytest.raises(CalibrationError, match="2 frames show known points"):
-        rig = rigs.Turntable(np.random.default_rng(0))
+        rig = turntables.Turntable(np.random.default_rng(0))
         adjust(
             nominal(rig), sightings(rig, [readings(0), readings(5)], 0, np.random.default_rng(0))
         )
@@ -378,7 +378,7 @@ def test_frames_without_a_board_are_refused_with_their_number():
 
 def test_collinear_spheres_still_tell_the_light_where_it_is_off_their_line():
     rng = np.random.default_rng(11)
-    rig = rigs.Turntable(rng)
+    rig = turntables.Turntable(rng)
     views = [readings(k) for k in range(16)]
     line = np.array([[-50.0, 40, 5], [0, 40, 5], [50, 40, 5]])
     start = nominal(rig)
@@ -388,7 +388,7 @@ def test_collinear_spheres_still_tell_the_light_where_it_is_off_their_line():
         start.kinematics,
         start.board,
         line + 0.3,
-        np.full(3, rigs.RADIUS),
+        np.full(3, turntables.RADIUS),
         start.lights_mm,
     )
     found = adjust(
@@ -396,14 +396,14 @@ def test_collinear_spheres_still_tell_the_light_where_it_is_off_their_line():
     )
     at = readings(9)
     light = found.geometry.light_position("lamp", at)
-    true = rig.light_direction(rigs.LIGHT, at["tilt"], at["turn"], at["arm"])
+    true = rig.light_direction(turntables.LIGHT, at["tilt"], at["turn"], at["arm"])
     assert angle_deg(light, true) < 0.1
     assert np.isfinite(found.condition)
 
 
 def test_a_light_seen_in_one_sphere_of_one_view_keeps_what_it_does_not_tell():
     rng = np.random.default_rng(12)
-    rig = rigs.Turntable(rng)
+    rig = turntables.Turntable(rng)
     views = [readings(k) for k in range(16)]
     one = [s for s in sphere_sightings(rig, views[:1], rng) if s.sphere == 0]
     found = adjust(nominal(rig), sightings(rig, views, 0.01, rng), one)
@@ -415,18 +415,18 @@ def test_a_light_seen_in_one_sphere_of_one_view_keeps_what_it_does_not_tell():
 
 def test_outliers_are_rejected_and_counted():
     rng = np.random.default_rng(13)
-    rig = rigs.Turntable(rng)
+    rig = turntables.Turntable(rng)
     seen = sightings(rig, [readings(k) for k in range(16)], 0.01, rng)
     for k in range(0, 16, 3):
         seen[k].pixels[5 * (k % 3) + 7] += [1.5, -0.8]
     found = adjust(nominal(rig, spheres=False), seen)
     assert 12 <= found.rejected <= 20
-    assert abs(found.geometry.camera.parameters[0] / rigs.TRUTH[0] - 1) < 1e-4
+    assert abs(found.geometry.camera.parameters[0] / turntables.TRUTH[0] - 1) < 1e-4
 
 
 def test_a_frame_whose_readings_contradict_its_image_is_named():
     rng = np.random.default_rng(14)
-    rig = rigs.Turntable(rng)
+    rig = turntables.Turntable(rng)
     seen = sightings(rig, [readings(k) for k in range(16)], 0.01, rng)
     wrong = dict(seen[6].readings)
     wrong["turn"] += 0.1
@@ -439,7 +439,7 @@ def test_a_frame_whose_readings_contradict_its_image_is_named():
 
 def test_small_slips_of_the_axes_are_found_where_they_are_allowed():
     rng = np.random.default_rng(15)
-    rig = rigs.Turntable(rng)
+    rig = turntables.Turntable(rng)
     views = [readings(k) for k in range(16)]
     seen = sightings(rig, views, 0.01, rng)
     slip = 3e-4 * rng.standard_normal((16, 2))
@@ -461,7 +461,7 @@ def test_small_slips_of_the_axes_are_found_where_they_are_allowed():
 
 
 def test_a_missing_reading_is_named():
-    rig = rigs.Turntable(np.random.default_rng(0))
+    rig = turntables.Turntable(np.random.default_rng(0))
     seen = sightings(rig, [readings(k) for k in range(4)], 0, np.random.default_rng(0))
     seen[2].readings.pop("turn")
     with pytest.raises(CalibrationError, match=r"axis 'turn' has reading None.*axis:turn"):
@@ -479,7 +479,7 @@ def test_a_missing_reading_is_named():
         (lambda: Board.from_json({"type": "dots"}), "boards are 'charuco'"),
         (lambda: Board.from_json({"squares": [9, 7], "square_mm": 4}), "marker_mm"),
         (lambda: Board((9, 7), 10, 7, "DICT_9").corners_mm, "no dictionary 'DICT_9'"),
-        (lambda: nominal(rigs.Turntable(np.random.default_rng(0))).light_position("sun", {}), "no light 'sun'"),
+        (lambda: nominal(turntables.Turntable(np.random.default_rng(0))).light_position("sun", {}), "no light 'sun'"),
     ],
 )  # fmt: skip
 def test_what_no_rig_has_is_refused_by_name(make, message):
@@ -488,7 +488,7 @@ def test_what_no_rig_has_is_refused_by_name(make, message):
 
 
 def test_a_geometry_comes_back_from_its_json():
-    rig = rigs.Turntable(np.random.default_rng(0))
+    rig = turntables.Turntable(np.random.default_rng(0))
     geometry = nominal(rig)
     back = Geometry.from_json(geometry.to_json())
     at = readings(5)

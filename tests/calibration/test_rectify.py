@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-import rigs
+import turntables
 from scipy import ndimage
 
 from btfkit.calibration.camera_model import Camera
@@ -111,12 +111,12 @@ def test_a_grating_loses_what_the_stated_footprint_says_where_pixels_are_coarser
 
 
 def near_camera(tilt, distance=260.0):
-    matrix = rigs.look_down(distance) @ rigs.turn([0, 1, 0], np.zeros(3), tilt)
+    matrix = turntables.look_down(distance) @ turntables.turn([0, 1, 0], np.zeros(3), tilt)
     return Rigid(matrix[:3, :3], matrix[:3, 3])
 
 
 def test_footprints_are_the_wanted_ones_where_the_camera_resolves_them_and_stated_where_not():
-    camera = Camera(rigs.WIDTH, rigs.HEIGHT, rigs.TRUTH)
+    camera = Camera(turntables.WIDTH, turntables.HEIGHT, turntables.TRUTH)
     grid = Grid(32, 32, 0.6)
     np.testing.assert_allclose(footprints(camera, near_camera(0), grid).footprint, 0.5, rtol=1e-5)
     coarse = footprints(camera, near_camera(np.radians(80)), grid)
@@ -129,7 +129,7 @@ def test_footprints_are_the_wanted_ones_where_the_camera_resolves_them_and_state
 
 @pytest.mark.parametrize("tilt_deg", [85, 89])
 def test_footprints_at_grazing_views_are_finite_and_integrate_the_texture_whole(tilt_deg):
-    camera = Camera(rigs.WIDTH, rigs.HEIGHT, rigs.TRUTH)
+    camera = Camera(turntables.WIDTH, turntables.HEIGHT, turntables.TRUTH)
     grid = Grid(48, 48, 0.5)
     where = footprints(camera, near_camera(np.radians(tilt_deg)), grid)
     seen = np.isfinite(where.place).all(-1)
@@ -138,15 +138,15 @@ def test_footprints_at_grazing_views_are_finite_and_integrate_the_texture_whole(
     assert np.isfinite(longest).all()
     # Foreshortened texels are seen through as many texels' blur.
     assert longest.min() > 0.3 / np.cos(np.radians(tilt_deg)) / 3
-    image = np.full((rigs.HEIGHT, rigs.WIDTH, 1), 0.7, np.float32)
+    image = np.full((turntables.HEIGHT, turntables.WIDTH, 1), 0.7, np.float32)
     found = rectify(image, where)
     assert found.valid.all()
     np.testing.assert_allclose(found.value, 0.7, rtol=1e-6)
 
 
 def test_a_plane_seen_from_below_or_at_its_edge_has_no_texels():
-    camera = Camera(rigs.WIDTH, rigs.HEIGHT, rigs.TRUTH)
-    image = np.ones((rigs.HEIGHT, rigs.WIDTH, 1), np.float32)
+    camera = Camera(turntables.WIDTH, turntables.HEIGHT, turntables.TRUTH)
+    image = np.ones((turntables.HEIGHT, turntables.WIDTH, 1), np.float32)
     for tilt in (90, 91, 130):
         found = rectify(image, footprints(camera, near_camera(np.radians(tilt)), Grid(8, 8, 1.0)))
         assert not found.valid.any()
@@ -154,9 +154,9 @@ def test_a_plane_seen_from_below_or_at_its_edge_has_no_texels():
 
 
 def test_texels_beyond_the_frame_or_on_unusable_pixels_are_not_valid_and_say_how_much_was_seen():
-    camera = Camera(rigs.WIDTH, rigs.HEIGHT, rigs.TRUTH)
+    camera = Camera(turntables.WIDTH, turntables.HEIGHT, turntables.TRUTH)
     where = footprints(camera, near_camera(0), Grid(40, 40, 6.0))
-    image = np.ones((rigs.HEIGHT, rigs.WIDTH, 1), np.float32)
+    image = np.ones((turntables.HEIGHT, turntables.WIDTH, 1), np.float32)
     image[300:360, 400:460] = np.nan
     found = rectify(image, where, variance=np.full_like(image, 0.01))
     assert 0 < found.valid.mean() < 1
@@ -169,9 +169,9 @@ def test_texels_beyond_the_frame_or_on_unusable_pixels_are_not_valid_and_say_how
 
 def test_the_variance_of_texels_is_what_repeated_noise_gives():
     rng = np.random.default_rng(1)
-    camera = Camera(rigs.WIDTH, rigs.HEIGHT, rigs.TRUTH)
+    camera = Camera(turntables.WIDTH, turntables.HEIGHT, turntables.TRUTH)
     where = footprints(camera, near_camera(0.6), Grid(24, 24, 0.6))
-    rows, columns = where.window(rigs.HEIGHT, rigs.WIDTH)
+    rows, columns = where.window(turntables.HEIGHT, turntables.WIDTH)
     shape = (rows.stop - rows.start, columns.stop - columns.start, 1)
     origin = (rows.start, columns.start)
     texels = np.stack([rectify(rng.standard_normal(shape).astype(np.float32), where, origin=origin).value for _ in range(150)])
@@ -182,12 +182,12 @@ def test_the_variance_of_texels_is_what_repeated_noise_gives():
 
 def test_a_window_of_the_frame_gives_the_same_texels_as_the_whole_frame():
     rng = np.random.default_rng(2)
-    camera = Camera(rigs.WIDTH, rigs.HEIGHT, rigs.TRUTH)
+    camera = Camera(turntables.WIDTH, turntables.HEIGHT, turntables.TRUTH)
     grid = Grid(64, 64, 0.5).window(slice(10, 30), slice(5, 50))
     where = footprints(camera, near_camera(0.7), grid, mosaic=True)
-    image = rng.random((rigs.HEIGHT, rigs.WIDTH, 1)).astype(np.float32)
+    image = rng.random((turntables.HEIGHT, turntables.WIDTH, 1)).astype(np.float32)
     sites = np.array([[0, 1], [1, 2]], np.int32)
-    rows, columns = where.window(rigs.HEIGHT, rigs.WIDTH)
+    rows, columns = where.window(turntables.HEIGHT, turntables.WIDTH)
     assert rows.stop - rows.start < 200
     whole = rectify(image, where, sites=sites)
     part = rectify(image[rows, columns], where, sites=sites, origin=(rows.start, columns.start))
@@ -205,10 +205,10 @@ def test_the_texels_of_a_window_are_those_of_the_grid():
 
 
 def test_a_relief_is_looked_for_where_parallax_puts_it():
-    camera = Camera(rigs.WIDTH, rigs.HEIGHT, rigs.TRUTH)
+    camera = Camera(turntables.WIDTH, turntables.HEIGHT, turntables.TRUTH)
     grid, pose = Grid(8, 8, 1.0), near_camera(0.8)
     raised = footprints(camera, pose, grid, height_mm=np.full((8, 8), 2.0))
-    expected = rigs.project(rigs.apply(np.vstack([np.c_[pose.rotation, pose.translation], [0, 0, 0, 1]]), grid.points() + [0, 0, 2]))
+    expected = turntables.project(turntables.apply(np.vstack([np.c_[pose.rotation, pose.translation], [0, 0, 0, 1]]), grid.points() + [0, 0, 2]))
     np.testing.assert_allclose(raised.place, expected, atol=1e-9)
 
 

@@ -89,7 +89,7 @@ def ewa_plain(
     across, down = np.ceil(np.max(reach[good], axis=0, initial=0.0)).astype(int) + 1
     for y in range(-down, down + 1):
         for x in range(-across, across + 1):
-            off = near + [x, y] - centre
+            off = near - centre + np.array([x, y])
             q = a * off[:, 0] ** 2 + 2 * b * off[:, 0] * off[:, 1] + d * off[:, 1] ** 2
             weight = np.where(good & (q < CUT), np.exp(-q / 2) - np.exp(-CUT / 2), 0.0)
             sums.add(near[:, 1] + y, near[:, 0] + x, weight)
