@@ -12,7 +12,7 @@ from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, optimize
 
 from btfkit.calibration.camera_model import Camera
 from btfkit.calibration.kinematics import Rigid
@@ -142,6 +142,25 @@ class Board:
             shift[~(np.abs(shift).max(axis=1) < 2.5)] = np.nan
         return start + shift
 
+    def blur(self, image: Floats, camera: Camera, pose: Rigid) -> float:
+        """Standard deviation of the lens's blur, px, beside the pixel's own square.
+
+        Args:
+            image: (h, w) linear values of a sharp, well lit view.
+            camera, pose: board to camera; good to a tenth of a pixel.
+        """
+        numbers = np.arange(len(self.corners_mm))
+        corners = camera.project(pose(self.corners_mm))
+        window = _Window.around(image, corners, self._reach_px(camera, pose, numbers))
+
+        def misfit(blur_px: float) -> float:
+            shift = window.fit(self._drawn(window, np.zeros_like(corners), camera, pose, blur_px))
+            shift = np.nan_to_num(shift)
+            return window.misfit(self._drawn(window, shift, camera, pose, blur_px))
+
+        best = optimize.minimize_scalar(misfit, bounds=(0.05, 3.0), options={"xatol": 0.01})
+        return float(best.x)
+
     def _reach_px(self, camera: Camera, pose: Rigid, numbers: NDArray[np.intp]) -> int:
         """Half width of the windows: the pattern's share, not more than the frame needs."""
         corners = self.corners_mm[numbers]
@@ -266,6 +285,26 @@ class _Window:
 
         The frame is black level + light * drawn + slope; solved with the slopes of the drawing.
         """
+        normal, right, _ = self._equations(drawn)
+        shift = np.full((len(drawn), 2), np.nan)
+        seen = np.isfinite(self.values).reshape(len(drawn), -1).mean(1) > 0.7
+        for k in np.flatnonzero(seen):
+            solved, _, rank, _ = np.linalg.lstsq(normal[k], right[k], rcond=1e-12)
+            if rank == 6 and abs(solved[1]) > 0:
+                shift[k] = -solved[4:] / solved[1]
+        return np.clip(shift, -1, 1)
+
+    def misfit(self, drawn: Floats) -> float:
+        """Share of the windows' squares that the drawing leaves, the median over windows."""
+        normal, right, square = self._equations(drawn)
+        left = []
+        for k in range(len(drawn)):
+            solved = np.linalg.lstsq(normal[k, :4, :4], right[k, :4], rcond=1e-12)[0]
+            left.append((square[k] - right[k, :4] @ solved) / max(square[k], 1e-300))
+        return float(np.median(left))
+
+    def _equations(self, drawn: Floats) -> tuple[Floats, Floats, Floats]:
+        """Normal equations (k, 6, 6), right sides (k, 6) and squares (k,) of the windows."""
         inner = drawn[:, 1:-1, 1:-1]
         across = (drawn[:, 1:-1, 2:] - drawn[:, 1:-1, :-2]) / 2
         down = (drawn[:, 2:, 1:-1] - drawn[:, :-2, 1:-1]) / 2
@@ -275,12 +314,8 @@ class _Window:
         weight = np.isfinite(self.values).astype(float)
         basis = (basis * weight[..., None]).reshape(len(drawn), -1, 6)
         target = np.nan_to_num(self.values).reshape(len(drawn), -1)
-        normal = basis.transpose(0, 2, 1) @ basis
-        right = (basis.transpose(0, 2, 1) @ target[..., None])[..., 0]
-        shift = np.full((len(drawn), 2), np.nan)
-        seen = weight.reshape(len(drawn), -1).mean(1) > 0.7
-        for k in np.flatnonzero(seen):
-            solved, _, rank, _ = np.linalg.lstsq(normal[k], right[k], rcond=1e-12)
-            if rank == 6 and abs(solved[1]) > 0:
-                shift[k] = -solved[4:] / solved[1]
-        return np.clip(shift, -1, 1)
+        return (
+            basis.transpose(0, 2, 1) @ basis,
+            (basis.transpose(0, 2, 1) @ target[..., None])[..., 0],
+            (target**2).sum(1),
+        )
