@@ -24,6 +24,8 @@ _FEWEST = 6
 # Half width of the part of the pattern that a corner is fitted to, in squares and in pixels.
 _REACH_SQUARES, _REACH_PX = 0.6, 11
 _SUBPIXELS = 3
+# Corners that are enough to tell how sharp the lens is.
+_BLUR_CORNERS = 24
 
 
 @final
@@ -142,15 +144,18 @@ class Board:
             shift[~(np.abs(shift).max(axis=1) < 2.5)] = np.nan
         return start + shift
 
-    def blur(self, image: Floats, camera: Camera, pose: Rigid) -> float:
+    def blur(
+        self, image: Floats, numbers: NDArray[np.intp], camera: Camera, pose: Rigid
+    ) -> float:
         """Standard deviation of the lens's blur, px, beside the pixel's own square.
 
         Args:
             image: (h, w) linear values of a sharp, well lit view.
-            camera, pose: board to camera; good to a tenth of a pixel.
+            numbers: (k,) corners that it shows.
+            camera, pose: board to camera; good to a pixel.
         """
-        numbers = np.arange(len(self.corners_mm))
-        corners = camera.project(pose(self.corners_mm))
+        numbers = numbers[:: max(len(numbers) // _BLUR_CORNERS, 1)]
+        corners = camera.project(pose(self.corners_mm[numbers]))
         window = _Window.around(image, corners, self._reach_px(camera, pose, numbers))
 
         def misfit(blur_px: float) -> float:

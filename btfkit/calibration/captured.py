@@ -95,6 +95,9 @@ def read(
         colour=COLOUR if rig.colour is not None else "the camera's own",
         texel_mm=grid.texel_mm,
         provenance={
+            "format": "sequence",
+            "source": str(path),
+            "options": {"texel_mm": texel_mm} if texel_mm else {},
             "calibration": {"ran": ran, "missing": dict(found.missing)},
             "assumed": rig.assumed,
             "synthetic": bool(sequence.document.get("synthetic", False)),

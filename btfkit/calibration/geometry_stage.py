@@ -38,18 +38,16 @@ class Found:
     """What a sequence tells of its rig.
 
     Attributes:
-        adjustment: the geometry and how well it is known.
-        blur_px: standard deviation of the lens's blur. single: the camera by itself.
+        adjustment: the geometry and how well it is known. single: the camera by itself.
     """
 
     adjustment: Adjustment
-    blur_px: float
     single: SingleCamera
 
     def to_json(self) -> dict[str, Any]:
         return {
             **self.adjustment.to_json(),
-            "blur_px": self.blur_px,
+            "blur_px": self.single.blur_px,
             "single_camera": {
                 "residual_px": self.single.residual_px,
                 "rejected": self.single.rejected,
@@ -70,9 +68,6 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
     frames = [sequence.frames[group[0]] for group in groups]
     pictures = [_grey(radiometry, sequence, group) for group in groups]
     single = calibrate_camera(pictures, board)
-    blur = board.blur(*_sharpest(single, pictures))
-    if abs(blur - single.blur_px) > 0.1:
-        single = calibrate_camera(pictures, board, blur_px=blur)
     sightings, first = [], None
     for frame, view in zip(frames, single.views, strict=True):
         if view is not None:
@@ -94,7 +89,7 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
             _grey(radiometry, sequence, group), rough, sequence.frames[group[0]]
         )
     ]
-    return Found(adjust(rough, sightings, spheres) if spheres else alone, blur, single)
+    return Found(adjust(rough, sightings, spheres) if spheres else alone, single)
 
 
 def nominal(sequence: Sequence) -> Geometry:
@@ -197,18 +192,10 @@ def _grey(radiometry: Radiometry, sequence: Sequence, group: tuple[int, ...]) ->
     return out
 
 
-def _sharpest(single: SingleCamera, pictures: list[Floats]) -> tuple[Floats, Camera, Rigid]:
-    """The picture that looks at the board most squarely, its camera and pose."""
-    seen = [(abs(view.pose.rotation[2, 2]), k) for k, view in enumerate(single.views) if view]
-    at = max(seen)[1]
-    view = single.views[at]
-    if view is None:
-        raise CalibrationError("no frame shows the board")
-    return pictures[at], single.camera, view.pose
-
-
 def _board_pose(sequence: Sequence) -> Rigid:
     """Board to sample, from origin_mm (first outer corner) and drawn axes x and y (down)."""
+    if "board" not in sequence.target:
+        return Rigid.identity()
     board = _section(sequence.target, "board", "target")
     size = Board.from_json(board)
     try:

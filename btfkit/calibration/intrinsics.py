@@ -70,7 +70,7 @@ class SingleCamera:
 
 
 def calibrate_camera(
-    images: Sequence[Floats], board: Board, *, blur_px: float = 0.6
+    images: Sequence[Floats], board: Board, *, blur_px: float | None = None
 ) -> SingleCamera:
     """A camera and the poses of a board in its frames.
 
@@ -79,7 +79,8 @@ def calibrate_camera(
     Args:
         images: (h, w) linear frames of one camera with the board in view.
         board: what is seen.
-        blur_px: standard deviation of the lens's blur, beside the pixel's own square.
+        blur_px: standard deviation of the lens's blur, beside the pixel's own square; None
+            measures it on the view that looks at the board most squarely.
 
     Raises:
         CalibrationError: fewer than three frames show the board, or their views are too alike.
@@ -98,9 +99,15 @@ def calibrate_camera(
     camera, views, sd = _solve(views, board, width, height)
     _refuse_parallel(views)
     camera, views, sd, rejected = _settled(views, board, width, height)
-    for _ in range(_ROUNDS):
+    if blur_px is None:
+        square = int(np.argmax([abs(view.pose.rotation[2, 2]) for view in views]))
+        seen = views[square]
+        blur_px = board.blur(images[usable[square]], seen.numbers, camera, seen.pose)
+    every = np.arange(len(board.corners_mm))
+    for turn in range(_ROUNDS):
+        # All corners that frames may show, those that detection missed among them; then the good.
         views = [
-            _refined(images[i], view, board, camera, blur_px)
+            _refined(images[i], view, every if turn == 0 else view.numbers, board, camera, blur_px)
             for i, view in zip(usable, views, strict=True)
         ]
         camera, views, sd, rejected = _settled(views, board, width, height)
@@ -118,9 +125,15 @@ def calibrate_camera(
     return SingleCamera(camera, sd, tuple(by_frame), rms, rejected, blur_px)
 
 
-def _refined(image: Floats, view: View, board: Board, camera: Camera, blur_px: float) -> View:
-    """All corners of the board that the frame shows, the rejected ones among them."""
-    numbers = np.arange(len(board.corners_mm))
+def _refined(
+    image: Floats,
+    view: View,
+    numbers: NDArray[np.intp],
+    board: Board,
+    camera: Camera,
+    blur_px: float,
+) -> View:
+    """The view with corners fitted to the frame, those of `numbers` that it shows."""
     pixels = board.refine(image, numbers, camera, view.pose, blur_px=blur_px)
     good = np.isfinite(pixels).all(axis=1)
     if good.sum() < 4:

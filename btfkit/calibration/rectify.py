@@ -23,8 +23,9 @@ Floats = NDArray[np.float64]
 ONE_TEXEL = 0.5
 # Variance of a square pixel along either side, px^2.
 _PIXEL = 1 / 12
-# Gaussians narrower than this fall between pixels; colours of a mosaic lie twice as far apart.
-_NARROWEST_PX = {False: 0.4, True: 0.8}
+# Gaussians narrower than half the distance of samples fall between them, and what is finer than
+# pixels comes back as stripes (0.7 % of it at this width). Colours of a mosaic lie two apart.
+_NARROWEST_PX = {False: 0.5, True: 1.0}
 # Sine of the slant below which a plane is seen edge on.
 _EDGE_ON = 1e-6
 # A texel of which a tenth was not seen is a guess about that tenth.

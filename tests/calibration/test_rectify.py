@@ -65,7 +65,7 @@ def gaussian_texels(cloth, sigma):
 def gaussian(frame, place, slope, threads=None):
     """Footprints of half a texel as `footprints` makes them, for an affine camera."""
     extra = 0.25 * slope @ slope.T - np.eye(2) / 12
-    extra = np.diag(np.maximum(np.diag(extra), 0.4**2))
+    extra = np.diag(np.maximum(np.diag(extra), 0.5**2))
     inverse = np.linalg.inv(extra / resample.KEPT)[[0, 0, 1], [0, 1, 1]]
     shapes = np.tile(inverse.astype(np.float32), (len(place), 1))
     return resample.ewa(frame[..., None], place, shapes, threads=threads).value.reshape(TEXELS, TEXELS)
@@ -103,7 +103,7 @@ def test_a_grating_loses_what_the_stated_footprint_says_where_pixels_are_coarser
     grating = np.tile(0.5 + 0.4 * np.sin(2 * np.pi * x / period), (size, 1))
     frame, place, slope = photographed(grating, np.radians(tilt_deg))
     found = gaussian(frame, place, slope)
-    present = np.maximum(0.25 * np.diag(slope) ** 2 - 1 / 12, 0.16) + 1 / 12
+    present = np.maximum(0.25 * np.diag(slope) ** 2 - 1 / 12, 0.25) + 1 / 12
     columns = np.sqrt(present[0]) / slope[0, 0]
     kept = np.exp(-2 * (np.pi * columns / period) ** 2)
     # At 80 degrees a period is 3.4 pixels: what Gaussians between pixels leave differs by some %.
@@ -123,7 +123,7 @@ def test_footprints_are_the_wanted_ones_where_the_camera_resolves_them_and_state
     longest, shortest = coarse.axes
     # 0.6 mm are 3.5 px across and 0.6 along: along, a pixel and the narrowest Gaussian are left.
     np.testing.assert_allclose(shortest, 0.5, rtol=1e-3)
-    expected = np.sqrt(0.4**2 + 1 / 12) / (0.6 * 5.78 * np.cos(np.radians(80)))
+    expected = np.sqrt(0.5**2 + 1 / 12) / (0.6 * 5.78 * np.cos(np.radians(80)))
     np.testing.assert_allclose(longest.mean(), expected, rtol=0.05)
 
 
