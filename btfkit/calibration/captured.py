@@ -190,7 +190,7 @@ class CapturedTextures(Textures):
         """A texture with its variance, coverage and validity."""
         group = self._groups[index]
         readings = self._sequence.frames[group[0]].axes
-        where = self._footprints(readings)
+        where = self.footprints(index)
         sensor = self._frame_size(group)
         window = where.window(*sensor)
         merged = self._merged(group, window)
@@ -237,8 +237,9 @@ class CapturedTextures(Textures):
             return h, w
         return sensor.height, sensor.width
 
-    def _footprints(self, readings: Mapping[str, float]) -> Footprints:
-        """Of a view; all lights of it share them."""
+    def footprints(self, index: int) -> Footprints:
+        """Where the texels of a texture lie in its frames; all lights of a view share them."""
+        readings = self._sequence.frames[self._groups[index][0]].axes
         chains = self._rig.geometry.kinematics.chains
         moved = (*chains.get("sample", ()), *chains.get("camera", ()))
         key = tuple(readings[name] for name in moved)
