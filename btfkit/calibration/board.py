@@ -69,7 +69,9 @@ class Board:
                 f"target.board of sequence.json lacks or garbles {error}",
                 remedy="give squares, square_mm and marker_mm",
             ) from error
-        return Board((int(columns), int(rows)), *sizes, str(entry.get("dictionary", "DICT_5X5_100")))
+        return Board(
+            (int(columns), int(rows)), *sizes, str(entry.get("dictionary", "DICT_5X5_100"))
+        )
 
     @cached_property
     def corners_mm(self) -> Floats:
@@ -107,7 +109,9 @@ class Board:
             return np.zeros(0, np.intp), np.zeros((0, 2))
         low, high = np.percentile(finite, [0.5, 99.5])
         # A square root brings dark squares of dimly lit views within eight bits.
-        scaled = np.sqrt(np.clip((np.nan_to_num(image, nan=low) - low) / max(high - low, 1e-12), 0, 1))
+        scaled = np.sqrt(
+            np.clip((np.nan_to_num(image, nan=low) - low) / max(high - low, 1e-12), 0, 1)
+        )
         detector = cv2.aruco.CharucoDetector(self._opencv)
         found, numbers, _, _ = detector.detectBoard((255 * scaled).astype(np.uint8))
         if found is None or numbers is None or len(numbers) < _FEWEST:
@@ -115,7 +119,13 @@ class Board:
         return numbers.reshape(-1).astype(np.intp), found.reshape(-1, 2).astype(float)
 
     def refine(
-        self, image: Floats, numbers: NDArray[np.intp], camera: Camera, pose: Rigid, *, blur_px: float
+        self,
+        image: Floats,
+        numbers: NDArray[np.intp],
+        camera: Camera,
+        pose: Rigid,
+        *,
+        blur_px: float,
     ) -> Floats:
         """Corners fitted with the board's own picture as the camera would see it.
 
@@ -144,9 +154,7 @@ class Board:
             shift[~(np.abs(shift).max(axis=1) < 2.5)] = np.nan
         return start + shift
 
-    def blur(
-        self, image: Floats, numbers: NDArray[np.intp], camera: Camera, pose: Rigid
-    ) -> float:
+    def blur(self, image: Floats, numbers: NDArray[np.intp], camera: Camera, pose: Rigid) -> float:
         """Standard deviation of the lens's blur, px, beside the pixel's own square.
 
         Args:
@@ -206,7 +214,8 @@ class Board:
         """OpenCV counts from the upper left corner, y down."""
         width, height = (count * self.square_mm for count in self.squares)
         return np.stack(
-            [points[..., 0] - width / 2, height / 2 - points[..., 1], np.zeros(points.shape[:-1])], -1
+            [points[..., 0] - width / 2, height / 2 - points[..., 1], np.zeros(points.shape[:-1])],
+            -1,
         )
 
     @cached_property

@@ -130,7 +130,9 @@ def _minimum(
         return problem.evaluate(full(part))[0][rows]
 
     def slopes(part: Floats) -> Any:
-        jacobian = problem.evaluate(full(part))[1][rows][:, columns].multiply(problem.scale[columns])
+        jacobian = problem.evaluate(full(part))[1][rows][:, columns].multiply(
+            problem.scale[columns]
+        )
         # Few columns are solved exactly; many, mostly of slips, sparsely.
         return jacobian.toarray() if len(columns) <= 600 else jacobian.tocsr()
 
@@ -194,8 +196,8 @@ def _refuse_contradiction(problem: Problem, residual: Floats) -> None:
     if bad.size:
         at = bad[np.argmax(rms[bad])]
         raise CalibrationError(
-            f"frame {problem.names_of_sightings[at]}: its axes put the target {rms[at]:.1f} px from "
-            f"where the image shows it; other frames agree to {np.median(rms):.2f} px",
+            f"frame {problem.names_of_sightings[at]}: its axes put the target {rms[at]:.1f} px "
+            f"from where the image shows it; other frames agree to {np.median(rms):.2f} px",
             remedy="check the readings of this frame, or leave it out",
         )
 

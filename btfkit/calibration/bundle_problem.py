@@ -171,7 +171,10 @@ class Problem:
             free = self.size - self._shared
             jacobians.append(
                 sparse.csr_array(
-                    (np.full(free, 1 / self.slip_sd), (np.arange(free), self._shared + np.arange(free))),
+                    (
+                        np.full(free, 1 / self.slip_sd),
+                        (np.arange(free), self._shared + np.arange(free)),
+                    ),
                     shape=(free, self.size),
                 )
             )
@@ -209,7 +212,10 @@ class Problem:
             block(f"light.{name}", [(f"light.{name}.{k}", _SCALE_LIGHT_MM) for k in "xyz"])
         self._shared = len(names)
         if self.slip_sd > 0:
-            block("slips", [(f"slip.{f}.{a}", self.slip_sd) for f in self._frames for a in self.axis_names])
+            block(
+                "slips",
+                [(f"slip.{f}.{a}", self.slip_sd) for f in self._frames for a in self.axis_names],
+            )
         self.names, self.scale, self.give_up = tuple(names), np.array(scales), np.array(gives)
 
     def _observations(self) -> None:
@@ -223,7 +229,9 @@ class Problem:
         self._outline_of = np.repeat(
             np.arange(len(self._spheres)), [len(s.outline) for s in self._spheres]
         ).astype(np.intp)
-        self._shown = [(k, name, at) for k, s in enumerate(self._spheres) for name, at in s.highlights.items()]
+        self._shown = [
+            (k, name, at) for k, s in enumerate(self._spheres) for name, at in s.highlights.items()
+        ]
         self._sphere_view = first + np.arange(len(self._spheres))
         counts = {"corner": 2 * len(self._points)}
         counts["outline"] = len(self._outline_of)
@@ -272,7 +280,9 @@ class Problem:
             at = np.array([k for k, _, _ in self._shown])
             lights = self._lights(geometry, x, self._sphere_view[at])
             where = highlight(centres.points[at], lights.points, radii[at])
-            by_centre, by_light = highlight_derivatives(centres.points[at], lights.points, radii[at])
+            by_centre, by_light = highlight_derivatives(
+                centres.points[at], lights.points, radii[at]
+            )
             moved = _Moved(
                 where,
                 by_centre @ centres.shared[at] + by_light @ lights.shared,
@@ -394,7 +404,7 @@ def _offset(pose: Rigid, by: Floats) -> Rigid:
 
 
 def _by_pose(turned: Floats, by: Floats) -> Floats:
-    """(n, 3, 6) derivative of moved points by an offset of the motion; `turned` before the shift."""
+    """(n, 3, 6) derivative of moved points by an offset; `turned` is before the shift."""
     out = np.empty((len(turned), 3, 6))
     out[:, :, :3] = -skew(turned) @ left_jacobian(by[:3])
     out[:, :, 3:] = np.eye(3)

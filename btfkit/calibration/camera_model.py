@@ -41,7 +41,9 @@ class Camera:
         if values.shape != (len(PARAMETERS),):
             raise ValueError(f"parameters have shape {values.shape}; expected ({len(PARAMETERS)},)")
         if not np.isfinite(values).all() or min(values[:2]) <= 0:
-            raise ValueError(f"parameters {values.tolist()} are no camera: focal lengths must be > 0")
+            raise ValueError(
+                f"parameters {values.tolist()} are no camera: focal lengths must be > 0"
+            )
         object.__setattr__(self, "parameters", values)
 
     @property
@@ -98,8 +100,8 @@ class Camera:
             (a, b), (c, d) = np.moveaxis(by_plane, (-2, -1), (0, 1))
             with np.errstate(all="ignore"):
                 det = a * d - b * c
-                step = np.stack([d * off[..., 0] - b * off[..., 1],
-                                 a * off[..., 1] - c * off[..., 0]], -1) / det[..., None]  # fmt: skip
+                across, down = off[..., 0], off[..., 1]
+                step = np.stack([d * across - b * down, a * down - c * across], -1) / det[..., None]
             plane = plane + step
             if not np.abs(step).max(initial=0.0) > 1e-15:
                 break

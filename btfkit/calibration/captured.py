@@ -277,7 +277,9 @@ class CapturedTextures(Textures):
             square = ((lamp - self._grid.points()) ** 2).sum(-1) / rig.distance_mm**2
             factor = square[..., None] * factor
         value = (found.value * factor).astype(np.float32)
-        variance = None if found.variance is None else (found.variance * factor**2).astype(np.float32)
+        variance = (
+            None if found.variance is None else (found.variance * factor**2).astype(np.float32)
+        )
         if rig.colour is not None and value.shape[2] == 3:
             value, variance = _corrected(rig.colour, value, variance)
         return replace(found, value=value, variance=variance)

@@ -78,9 +78,14 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
         placed = Geometry.placed(single.camera, start.kinematics, start.board, *first)
         start = replace(start, camera=single.camera, camera_pose=placed.camera_pose)
     # The axes first: spheres are then found where they are.
-    alone = adjust(replace(start, lights_mm={}, spheres_mm=np.zeros((0, 3)), radii_mm=np.zeros(0)), sightings)
+    alone = adjust(
+        replace(start, lights_mm={}, spheres_mm=np.zeros((0, 3)), radii_mm=np.zeros(0)), sightings
+    )
     rough = replace(
-        alone.geometry, spheres_mm=start.spheres_mm, radii_mm=start.radii_mm, lights_mm=start.lights_mm
+        alone.geometry,
+        spheres_mm=start.spheres_mm,
+        radii_mm=start.radii_mm,
+        lights_mm=start.lights_mm,
     )
     spheres = [
         sighting
@@ -105,7 +110,9 @@ def nominal(sequence: Sequence) -> Geometry:
                  _vector(a.get("point_mm", (0, 0, 0))))
             for a in rig["axes"]
         ]  # fmt: skip
-        carries = {body: tuple(rig["carries"].get(body, ())) for body in ("sample", "camera", "light")}
+        carries = {
+            body: tuple(rig["carries"].get(body, ())) for body in ("sample", "camera", "light")
+        }
         camera, lamp = rig["camera"], rig.get("light", {})
         turn, eye = np.array(camera["rotation"], float), _vector(camera["position_mm"])
         focal, centre = (np.array(camera[key], float) for key in ("focal_px", "centre_px"))
@@ -204,7 +211,11 @@ def _board_pose(sequence: Sequence) -> Rigid:
         width, height = (n * size.square_mm for n in size.squares)
         rotation = np.stack([across, -down, np.cross(across, -down)], axis=1)
         corner = board.get("origin_mm")
-        middle = np.zeros(3) if corner is None else _vector(corner) + across * width / 2 + down * height / 2
+        middle = (
+            np.zeros(3)
+            if corner is None
+            else _vector(corner) + across * width / 2 + down * height / 2
+        )
     except (TypeError, ValueError) as error:
         raise CalibrationError(f"target.board of {_DOCUMENT} has no pose ({error})") from error
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):

@@ -227,4 +227,6 @@ def _inverse(matrix: Floats) -> Floats:
 
 
 def _packed(matrix: NDArray[np.floating]) -> Array:
-    return np.stack([matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]], -1).astype(np.float32)
+    return np.stack([matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]], -1).astype(
+        np.float32
+    )

@@ -102,11 +102,15 @@ def period_of(texture: Floats) -> float | None:
 
 
 def _prepared(first: Floats, second: Floats, within: float) -> tuple[Floats, Floats, Floats]:
-    """Both without their means and trends, 0 where either is not valid, and the mask of the rest."""
+    """Both without their trends, 0 where either is not valid, and the mask of the rest."""
     if first.shape != second.shape or first.ndim != 2 or min(first.shape) < 8:
-        raise ValueError(f"textures {first.shape} and {second.shape}; expected two (h, w), h, w >= 8")
+        raise ValueError(
+            f"textures {first.shape} and {second.shape}; expected two (h, w), h, w >= 8"
+        )
     if not 0 < within < min(first.shape) / 4:
-        raise ValueError(f"within = {within:g}; expected up to a quarter of {min(first.shape)} texels")
+        raise ValueError(
+            f"within = {within:g}; expected up to a quarter of {min(first.shape)} texels"
+        )
     valid = np.isfinite(first) & np.isfinite(second)
     if valid.mean() < 0.25:
         raise CalibrationError(
@@ -162,7 +166,7 @@ def _frequencies(shape: tuple[int, ...]) -> tuple[Floats, Floats]:
 
 
 def _moved(picture: Floats, by: Floats) -> Floats:
-    """A picture shifted by (rows, columns); it comes back in on the other side, under the window."""
+    """A picture shifted by (rows, columns), round about: the window hides where it comes in."""
     if not np.any(by):
         return picture
     down, across = _frequencies(picture.shape)

@@ -11,10 +11,10 @@ import numpy as np
 from btfkit import documents
 from btfkit.calibration.calibration import Calibration, Section
 from btfkit.calibration.colours import ColourCorrection
-from btfkit.calibration.lamp_stage import LIT, lamp_factors, lamp_frames
-from btfkit.calibration.noise import Fitted
 from btfkit.calibration.geometry import Geometry
 from btfkit.calibration.geometry_stage import LAMP, fit_geometry
+from btfkit.calibration.lamp_stage import LIT, lamp_factors, lamp_frames
+from btfkit.calibration.noise import Fitted
 from btfkit.calibration.placement import Placement, calibrated, nominal, of_directions
 from btfkit.calibration.radiometry import Radiometry
 from btfkit.calibration.references import (

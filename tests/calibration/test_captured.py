@@ -39,7 +39,9 @@ def test_a_ramp_of_light_comes_out_at_every_texel_as_the_ramp_where_the_camera_s
     turn = np.array([[1, 0, 0], [0, -0.857493, -0.514496], [0, 0.514496, -0.857493]])
     x, y = np.meshgrid((np.arange(14) - 6.5) * 0.5, (5.5 - np.arange(12)) * 0.5)
     seen = (np.stack([x, y, 0 * x], -1) - [0, -60, 100]) @ turn.T
-    column, row = (400 * seen[..., k] / seen[..., 2] + middle for k, middle in ((0, 31.5), (1, 23.5)))
+    column, row = (
+        400 * seen[..., k] / seen[..., 2] + middle for k, middle in ((0, 31.5), (1, 23.5))
+    )
     expected = (300 + 20 * column + 10 * row) / 0.01
     inside = np.isfinite(btf.texture(0)[..., 0])
     assert inside.mean() > 0.8
@@ -49,7 +51,9 @@ def test_a_ramp_of_light_comes_out_at_every_texel_as_the_ramp_where_the_camera_s
 
 def test_positions_footprint_and_what_was_assumed_are_kept(run):
     btf = btfkit.open(run)
-    np.testing.assert_allclose(np.linalg.norm(btf.view_position, axis=1), np.hypot(60, 100), rtol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm(btf.view_position, axis=1), np.hypot(60, 100), rtol=1e-6
+    )
     np.testing.assert_allclose(np.linalg.norm(btf.light_position, axis=1), 200, rtol=1e-6)
     np.testing.assert_allclose(btf.footprint, btf.footprint[0], rtol=0.2)
     assert (btf.footprint >= 0.499).all()
@@ -58,7 +62,9 @@ def test_positions_footprint_and_what_was_assumed_are_kept(run):
     assert btf.provenance["calibration"]["missing"]["white"] == "no frames of kind white"
 
 
-def test_only_the_frames_of_the_asked_pair_are_read_and_variance_costs_nothing_more(run, monkeypatch):
+def test_only_the_frames_of_the_asked_pair_are_read_and_variance_costs_nothing_more(
+    run, monkeypatch
+):
     btf = btfkit.open(run)
     read = []
     image = Sequence.image
@@ -124,7 +130,7 @@ def test_a_sequence_without_frames_of_the_sample_is_refused(run):
 def test_a_frame_without_a_reading_and_a_frame_of_another_size_are_named(run):
     copy = Path(shutil.copytree(run, run.with_name("copy")))
     (copy / "frames" / "001.png").write_bytes(counts.encode_png(np.zeros((20, 30), np.uint16)))
-    with pytest.raises(FormatError, match="001.png.*30 x 20"):
+    with pytest.raises(FormatError, match=r"001.png.*30 x 20"):
         btfkit.open(copy).texture(1)
     table = run / "sequence.csv"
     lines = table.read_text().splitlines()
@@ -138,7 +144,9 @@ def test_a_frame_without_a_reading_and_a_frame_of_another_size_are_named(run):
 
 def test_a_sample_seen_from_below_has_no_valid_texel(run):
     def below(document):
-        document["rig"]["camera"].update(position_mm=[0, 0, -100], rotation=[[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+        document["rig"]["camera"].update(
+            position_mm=[0, 0, -100], rotation=[[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+        )
 
     with pytest.raises(ValueError, match="below the surface"):
         btfkit.open(edited(run, below))

@@ -48,7 +48,11 @@ def photographed(cloth, tilt):
     frame = integrated(cloth, rows, columns)
     middle = 200 + (np.arange(TEXELS) + 0.5) * SCALE * FINE
     place = np.meshgrid((middle - columns[0]) / wide - 0.5, (middle - rows[0]) / FINE - 0.5)
-    return frame.astype(np.float32), np.stack(place, -1).reshape(-1, 2), np.diag([SCALE * np.cos(tilt), SCALE])
+    return (
+        frame.astype(np.float32),
+        np.stack(place, -1).reshape(-1, 2),
+        np.diag([SCALE * np.cos(tilt), SCALE]),
+    )
 
 
 def snr_db(truth, found):
@@ -68,11 +72,15 @@ def gaussian(frame, place, slope, threads=None):
     extra = np.diag(np.maximum(np.diag(extra), 0.5**2))
     inverse = np.linalg.inv(extra / resample.KEPT)[[0, 0, 1], [0, 1, 1]]
     shapes = np.tile(inverse.astype(np.float32), (len(place), 1))
-    return resample.ewa(frame[..., None], place, shapes, threads=threads).value.reshape(TEXELS, TEXELS)
+    return resample.ewa(frame[..., None], place, shapes, threads=threads).value.reshape(
+        TEXELS, TEXELS
+    )
 
 
 @pytest.mark.parametrize(("tilt_deg", "least_db"), [(0, 33), (45, 26), (60, 18)])
-def test_a_fabric_keeps_its_texture_at_any_tilt_where_bilinear_samples_lose_it(cloth, tilt_deg, least_db):
+def test_a_fabric_keeps_its_texture_at_any_tilt_where_bilinear_samples_lose_it(
+    cloth, tilt_deg, least_db
+):
     frame, place, slope = photographed(cloth, np.radians(tilt_deg))
     truth = gaussian_texels(cloth, (0.5, 0.5))
     assert snr_db(truth, gaussian(frame, place, slope)) >= least_db
@@ -81,7 +89,9 @@ def test_a_fabric_keeps_its_texture_at_any_tilt_where_bilinear_samples_lose_it(c
 
 
 @pytest.mark.parametrize("tilt_deg", [0, 45, 60])
-def test_integrated_areas_are_nearer_to_the_means_over_texels_than_dense_bilinear_samples(cloth, tilt_deg):
+def test_integrated_areas_are_nearer_to_the_means_over_texels_than_dense_bilinear_samples(
+    cloth, tilt_deg
+):
     frame, place, slope = photographed(cloth, np.radians(tilt_deg))
     edges = 200 + np.arange(TEXELS + 1) * SCALE * FINE
     truth = integrated(cloth, edges, edges)
@@ -89,7 +99,12 @@ def test_integrated_areas_are_nearer_to_the_means_over_texels_than_dense_bilinea
     area = resample.area(frame[..., None], place, shapes).value.reshape(TEXELS, TEXELS)
     step = (np.arange(8) + 0.5) / 8 - 0.5
     dense = np.mean(
-        [ndimage.map_coordinates(frame, (place + slope @ [u, v])[:, ::-1].T, order=1) for u in step for v in step], 0
+        [
+            ndimage.map_coordinates(frame, (place + slope @ [u, v])[:, ::-1].T, order=1)
+            for u in step
+            for v in step
+        ],
+        0,
     )
     assert snr_db(truth, area) > snr_db(truth, dense.reshape(TEXELS, TEXELS)) + 2
     # The fibres of this cloth are finer than a pixel: nobody can put them on one side of an edge.
@@ -97,7 +112,9 @@ def test_integrated_areas_are_nearer_to_the_means_over_texels_than_dense_bilinea
 
 
 @pytest.mark.parametrize("tilt_deg", [0, 75, 80])
-def test_a_grating_loses_what_the_stated_footprint_says_where_pixels_are_coarser_than_texels(tilt_deg):
+def test_a_grating_loses_what_the_stated_footprint_says_where_pixels_are_coarser_than_texels(
+    tilt_deg,
+):
     size, period = int(TEXELS * SCALE * FINE) + 400, 6.0
     x = np.arange(size) / (SCALE * FINE)
     grating = np.tile(0.5 + 0.4 * np.sin(2 * np.pi * x / period), (size, 1))
@@ -107,7 +124,9 @@ def test_a_grating_loses_what_the_stated_footprint_says_where_pixels_are_coarser
     columns = np.sqrt(present[0]) / slope[0, 0]
     kept = np.exp(-2 * (np.pi * columns / period) ** 2)
     # At 80 degrees a period is 3.4 pixels: what Gaussians between pixels leave differs by some %.
-    assert found.std() / (0.4 / np.sqrt(2)) == pytest.approx(kept, rel=0.01 if tilt_deg == 0 else 0.06)
+    assert found.std() / (0.4 / np.sqrt(2)) == pytest.approx(
+        kept, rel=0.01 if tilt_deg == 0 else 0.06
+    )
 
 
 def near_camera(tilt, distance=260.0):
@@ -174,8 +193,15 @@ def test_the_variance_of_texels_is_what_repeated_noise_gives():
     rows, columns = where.window(turntables.HEIGHT, turntables.WIDTH)
     shape = (rows.stop - rows.start, columns.stop - columns.start, 1)
     origin = (rows.start, columns.start)
-    texels = np.stack([rectify(rng.standard_normal(shape).astype(np.float32), where, origin=origin).value for _ in range(150)])
-    said = rectify(np.zeros(shape, np.float32), where, variance=np.ones(shape, np.float32), origin=origin).variance
+    texels = np.stack(
+        [
+            rectify(rng.standard_normal(shape).astype(np.float32), where, origin=origin).value
+            for _ in range(150)
+        ]
+    )
+    said = rectify(
+        np.zeros(shape, np.float32), where, variance=np.ones(shape, np.float32), origin=origin
+    ).variance
     # 150 frames of 576 texels with a few neighbours in common: 1 % of the mean variance
     assert texels.var(axis=0).mean() / said.mean() == pytest.approx(1, abs=0.02)
 
@@ -208,7 +234,12 @@ def test_a_relief_is_looked_for_where_parallax_puts_it():
     camera = Camera(turntables.WIDTH, turntables.HEIGHT, turntables.TRUTH)
     grid, pose = Grid(8, 8, 1.0), near_camera(0.8)
     raised = footprints(camera, pose, grid, height_mm=np.full((8, 8), 2.0))
-    expected = turntables.project(turntables.apply(np.vstack([np.c_[pose.rotation, pose.translation], [0, 0, 0, 1]]), grid.points() + [0, 0, 2]))
+    expected = turntables.project(
+        turntables.apply(
+            np.vstack([np.c_[pose.rotation, pose.translation], [0, 0, 0, 1]]),
+            grid.points() + [0, 0, 2],
+        )
+    )
     np.testing.assert_allclose(raised.place, expected, atol=1e-9)
 
 
@@ -221,10 +252,18 @@ def hostile(rng):
     inverse = np.linalg.inv(sides @ sides.transpose(0, 2, 1) + 0.3 * np.eye(2))
     packed = np.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], -1).astype(np.float32)
     packed[5], packed[6], packed[7] = [1, 2, 1], [0, 0, 1], np.nan
-    return image, rng.random(image.shape).astype(np.float32), place, packed, sides.astype(np.float32)
+    return (
+        image,
+        rng.random(image.shape).astype(np.float32),
+        place,
+        packed,
+        sides.astype(np.float32),
+    )
 
 
-needs_kernel = pytest.mark.skipif(resample.native.load("resample") is None, reason="kernel not built")
+needs_kernel = pytest.mark.skipif(
+    resample.native.load("resample") is None, reason="kernel not built"
+)
 
 
 @needs_kernel
@@ -239,7 +278,9 @@ def test_the_kernel_of_gaussians_is_its_twin_on_random_and_hostile_input(mosaic)
         plain = resample.ewa_plain(*given, variance=variance[..., :depth], sites=sites)
         for name in fast._fields:
             # float64 sums in another order, stored as float32
-            np.testing.assert_allclose(getattr(fast, name), getattr(plain, name), rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(
+                getattr(fast, name), getattr(plain, name), rtol=1e-5, atol=1e-6
+            )
 
 
 @needs_kernel
@@ -260,9 +301,15 @@ def test_the_kernel_refuses_arrays_that_do_not_fit():
     out = [np.empty((3, 1), np.float32) for _ in range(3)]
     sites = np.full((2, 2), -1, np.int32)
     with pytest.raises(ValueError, match="shapes do not fit"):
-        module.ewa(image, none, sites, np.zeros((3, 2)), np.zeros((2, 3), np.float32), 14.0, 1, *out)
+        module.ewa(
+            image, none, sites, np.zeros((3, 2)), np.zeros((2, 3), np.float32), 14.0, 1, *out
+        )
     with pytest.raises(ValueError, match="out does not fit"):
-        module.ewa(image, none, sites, np.zeros((2, 2)), np.zeros((2, 3), np.float32), 14.0, 1, *out)
+        module.ewa(
+            image, none, sites, np.zeros((2, 2)), np.zeros((2, 3), np.float32), 14.0, 1, *out
+        )
+    sites[0, 0] = 1
     with pytest.raises(ValueError, match="a site without a channel"):
-        sites[0, 0] = 1
-        module.ewa(image, none, sites, np.zeros((3, 2)), np.zeros((3, 3), np.float32), 14.0, 1, *out)
+        module.ewa(
+            image, none, sites, np.zeros((3, 2)), np.zeros((3, 3), np.float32), 14.0, 1, *out
+        )

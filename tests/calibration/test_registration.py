@@ -29,7 +29,9 @@ def shifted(picture, by):
 @pytest.mark.parametrize(
     ("kind", "within"), [("sharp", 4.0), ("defocused", 4.0), ("weave 9", 4.4), ("weave 4", 1.9)]
 )
-def test_shifts_are_found_to_a_hundredth_of_a_texel_on_periodic_and_aperiodic_textures(kind, within):
+def test_shifts_are_found_to_a_hundredth_of_a_texel_on_periodic_and_aperiodic_textures(
+    kind, within
+):
     rng = np.random.default_rng(0)
     off, deviations = [], []
     for _ in range(8):
@@ -60,7 +62,7 @@ def test_a_purely_periodic_texture_is_registered_within_its_bound_and_never_a_pe
 def test_a_constant_texture_says_that_it_cannot_tell(noise):
     rng = np.random.default_rng(1)
     first, second = 0.5 + noise * rng.standard_normal((2, 128, 128))
-    with pytest.raises(CalibrationError, match="constant.*tells a shift|shifted by .* beyond"):
+    with pytest.raises(CalibrationError, match=r"constant.*tells a shift|shifted by .* beyond"):
         register(first, second, within=3)
 
 
@@ -81,14 +83,14 @@ def test_invalid_texels_are_left_out():
     found = register(first, second, within=2)
     # Half the area is left of noise-free pictures; the rest is the mask's soft edge.
     assert (found.rows, found.columns) == pytest.approx((0.4, -0.3), abs=0.02)
-    with pytest.raises(CalibrationError, match="only .* of the texels are valid"):
+    with pytest.raises(CalibrationError, match=r"only .* of the texels are valid"):
         register(np.where(np.arange(128) < 20, first, np.nan), second, within=2)
 
 
 def test_a_shift_beyond_the_bound_is_refused():
     picture = texture("sharp", np.random.default_rng(4))
     first, second = picture[64:192, 64:192], shifted(picture, (5.0, 0.0))[64:192, 64:192]
-    with pytest.raises(CalibrationError, match="beyond the bound of 3|constant"):
+    with pytest.raises(CalibrationError, match=r"beyond the bound of 3|constant"):
         register(first, second, within=3)
     for bad in (0.0, 40.0):
         with pytest.raises(ValueError, match="quarter"):
