@@ -30,7 +30,7 @@ from btfkit.calibration.stages import (
     scale_of,
     stray_of,
 )
-from btfkit.calibration.stray import Stray
+from btfkit.calibration.stray import Stray, frame_means
 from btfkit.errors import CalibrationError
 from btfkit.sequence import TABLE, Sequence
 from btfkit.textures import Textures
@@ -40,6 +40,8 @@ Floats = NDArray[np.floating]
 # Camera pixels that a texel gets by default, seen as squarely as it is: of a mosaic, whose colours
 # lie apart, more.
 _PIXELS_A_TEXEL = {False: 2.0, True: 3.0}
+# Pixels that tell the mean of a frame: 1 of 25.
+_EVERY = slice(2, None, 5)
 # Views whose footprints are kept at hand, and variances that wait to be asked for.
 _VIEWS, _WAITING = 8, 192
 
@@ -254,19 +256,17 @@ class CapturedTextures(Textures):
         return known
 
     def _merged(self, group: tuple[int, ...], window: tuple[slice, slice]) -> Merged | None:
-        """Merged exposures of the window; of the whole frame only where stray light asks for it."""
+        """Merged exposures of the window, without stray light."""
         rows, columns = window
         if rows.stop <= rows.start or columns.stop <= columns.start:
             return None
         rig, sequence = self._rig, self._sequence
         lamp = [rig.lamp.get(i, 1.0) for i in group]
-        if rig.stray is not None and rig.stray.share > 0:
-            whole = rig.radiometry.radiance(sequence, group, lamp=lamp)
-            h, w = whole.radiance.shape[:2]
-            colours = rig.radiometry.colours((h, w)) if whole.radiance.ndim == 2 else None
-            clean = rig.stray.removed(whole, rig.radiometry.shading, colours)
-            return Merged(clean.radiance[window], clean.variance[window], clean.validity[window])
-        return _merged_window(rig.radiometry, sequence, group, window, lamp)
+        merged = _merged_window(rig.radiometry, sequence, group, window, lamp)
+        if rig.stray is None or rig.stray.share == 0:
+            return merged
+        sparse = _merged_window(rig.radiometry, sequence, group, (_EVERY, _EVERY), lamp)
+        return _without_stray(rig, merged, sparse, window)
 
     def _scaled(self, found: Rectified, readings: Mapping[str, float]) -> Rectified:
         """From radiance to the quantity of a BTF, with the lamp's distance at every texel."""
@@ -320,11 +320,11 @@ def _merged_window(
         image = sequence.image(i)
         channels = 1 if image.ndim == 2 else image.shape[2]
         raw.append(as_plane(image[window]))
-    rows, columns = window
-    wide = rows, slice(columns.start * channels, columns.stop * channels)
 
     def part(value: Any) -> Any:
-        return value[wide] if np.ndim(value) == 2 else value
+        if np.ndim(value) != 2:
+            return value
+        return as_plane(value.reshape(len(value), -1, channels)[window])
 
     noise = replace(
         noise, black=part(noise.black), dark=part(noise.dark), sensitivity=part(noise.sensitivity)
@@ -332,12 +332,34 @@ def _merged_window(
     merged = merge_exposures(raw, [t * radiometry.factor(t) for t in times], noise, lamp=lamp)
     if channels == 1:
         return merged
-    shape = (rows.stop - rows.start, -1, channels)
+    shape = (len(merged.radiance), -1, channels)
     return Merged(
         merged.radiance.reshape(shape),
         merged.variance.reshape(shape),
         merged.validity.reshape(shape),
     )
+
+
+def _without_stray(
+    rig: _Rig, merged: Merged, sparse: Merged, window: tuple[slice, slice]
+) -> Merged:
+    """As `Stray.removed`, with the frame's mean from a part of its pixels."""
+    if rig.stray is None:
+        return merged
+    shading = rig.radiometry.shading
+    h, w = merged.radiance.shape[:2]
+    lens: Floats = np.ones((h, w)) if shading is None else shading[window]
+    rows, columns = sparse.radiance.shape[:2]
+    few: Floats = np.ones((rows, columns)) if shading is None else shading[_EVERY, _EVERY]
+    if merged.radiance.ndim == 3:
+        spread: Floats = rig.stray.share * frame_means(sparse, few, None) / lens[..., None]
+    else:
+        # An odd step meets the colours of a mosaic in the order of the mosaic itself, and windows
+        # begin with a whole cell of it.
+        added = rig.stray.share * frame_means(sparse, few, rig.radiometry.colours((rows, columns)))
+        own = rig.radiometry.colours((h, w))
+        spread = (added[0] if own is None else added[own]) / lens
+    return replace(merged, radiance=(merged.radiance - spread).astype(np.float32))
 
 
 def _corrected(
