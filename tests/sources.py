@@ -152,8 +152,45 @@ def _bonn(folder: Path) -> Path:
     return folder / "wool.btf"
 
 
+def _sequence(folder: Path) -> Path:
+    """Two places of a camera and two of a lamp; the sensor and the rig as they are stated."""
+    from btfkit import counts
+    from btfkit.sequence import Frame, save
+
+    rng = np.random.default_rng(8)
+    run = folder / "run"
+    (run / "frames").mkdir(parents=True)
+    columns, rows = np.meshgrid(np.arange(64), np.arange(48))
+    frames = []
+    for k in range(PAIRS):
+        name = f"frames/{k:03}.png"
+        wave = np.sin(columns / (2 + k)) * np.cos(rows / 3.0)
+        image = 200 + 800 * (1.2 + wave) + 5 * rng.standard_normal(wave.shape)
+        (run / name).write_bytes(counts.encode_png(image.astype(np.uint16)))
+        axes = {"ring": 0.4 * (k // 2), "arm": 0.1 + 0.2 * (k % 2)}
+        frames.append(Frame(name, "sample", axes, exposure_s=0.01, lamp=1.0, group=k))
+    line = {"kind": "rotary", "point_mm": [0, 0, 0]}
+    document = {
+        "sensor": {"width": 64, "height": 48, "bits": 12, "black": 200, "white": 4095,
+                   "gain_e_per_dn": 2.0, "read_noise_e": 3.0},
+        "rig": {
+            "axes": [{"name": "ring", "direction": [0, 0, 1], **line},
+                     {"name": "arm", "direction": [0, 1, 0], **line}],
+            "carries": {"camera": ["ring"], "light": ["arm"]},
+            "camera": {"position_mm": [0, -60, 100], "focal_px": [400, 400],
+                       "centre_px": [31.5, 23.5],
+                       "rotation": [[1, 0, 0], [0, -0.857493, -0.514496], [0, 0.514496, -0.857493]]},
+            "light": {"position_mm": [0, 0, 200]},
+        },
+        "target": {"sample": {"size_mm": [7, 6]}},
+    }  # fmt: skip
+    save(run, frames, document)
+    return run
+
+
 SOURCES: dict[str, Callable[[Path], Path]] = {
     "zarr": _zarr,
+    "sequence": _sequence,
     "axf": _axf,
     "manifest": _manifest,
     "spectral": _spectral,

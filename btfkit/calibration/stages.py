@@ -11,9 +11,11 @@ import numpy as np
 from btfkit import documents
 from btfkit.calibration.calibration import Calibration, Section
 from btfkit.calibration.colours import ColourCorrection
+from btfkit.calibration.geometry import Geometry
+from btfkit.calibration.geometry_stage import LAMP, fit_geometry
 from btfkit.calibration.lamp_stage import LIT, lamp_factors, lamp_frames
 from btfkit.calibration.noise import Fitted
-from btfkit.calibration.placement import Placement, nominal, of_directions
+from btfkit.calibration.placement import Placement, calibrated, nominal, of_directions
 from btfkit.calibration.radiometry import Radiometry
 from btfkit.calibration.references import (
     Scene,
@@ -27,9 +29,9 @@ from btfkit.calibration.white import Scale
 from btfkit.sequence import Sequence as Frames
 
 Progress = Callable[[float, float], None]
-ORDER = ("radiometry", "lamp", "stray", "white", "colour")
+ORDER = ("radiometry", "lamp", "geometry", "stray", "white", "colour")
 # Raised with what a stage computes: sections of older code are made again.
-_REVISION = {"radiometry": 1, "lamp": 1, "stray": 1, "white": 1, "colour": 1}
+_REVISION = {"radiometry": 1, "lamp": 1, "geometry": 1, "stray": 1, "white": 1, "colour": 1}
 _NEEDED = {"radiometry"}
 
 
@@ -67,8 +69,25 @@ def calibrate(
             else:
                 found = found.with_section(name, _made(sequence, name, found, placed, inputs))
                 ran.append(name)
+        if name == "geometry" and placement is None and name in found.sections:
+            placed = placed_by(found) or placed
         progress(done + 1, len(ORDER))
     return found, ran
+
+
+def geometry_of(found: Calibration) -> Geometry:
+    """The geometry of a calibration.
+
+    Raises:
+        CalibrationError: it was not calibrated.
+    """
+    return Geometry.from_json(found.section("geometry").data)
+
+
+def placed_by(found: Calibration) -> Placement | None:
+    """Where things are by the calibrated geometry; None where it knows no lamp."""
+    geometry = geometry_of(found)
+    return calibrated(geometry, LAMP) if LAMP in geometry.lights_mm else None
 
 
 def placement_of(sequence: Frames) -> Placement:
@@ -83,9 +102,10 @@ def placement_of(sequence: Frames) -> Placement:
 
 def fingerprint(sequence: Frames, name: str, found: Calibration, placed: Placement) -> str:
     """SHA-256 over all that a stage reads: frames, their lines of the table, settings, sections."""
-    earlier = {"radiometry": (), "lamp": ("radiometry",), "stray": ("radiometry", "lamp"),
-               "white": ("radiometry", "lamp", "stray"),
-               "colour": ("radiometry", "lamp", "stray", "white")}[name]  # fmt: skip
+    earlier = {"radiometry": (), "lamp": ("radiometry",), "geometry": ("radiometry",),
+               "stray": ("radiometry", "lamp", "geometry"),
+               "white": ("radiometry", "lamp", "geometry", "stray"),
+               "colour": ("radiometry", "lamp", "geometry", "stray", "white")}[name]  # fmt: skip
     document: dict[str, Any] = {
         "stage": name,
         "revision": _REVISION[name],
@@ -100,6 +120,9 @@ def fingerprint(sequence: Frames, name: str, found: Calibration, placed: Placeme
         document["target"] = target.get("white") if name == "white" else target.get("patches")
         document["placement"] = placed.source
         document["rig"] = dict(sequence.rig)
+    if name == "geometry":
+        document["target"] = {key: sequence.target.get(key) for key in ("board", "spheres")}
+        document["rig"] = dict(sequence.rig)
     if name == "lamp":
         document["readings"] = [
             [f.file, f.lamp, f.time_s] for f in (sequence.frames[i] for i in sequence.of_kind(*LIT))
@@ -112,6 +135,8 @@ def _frames_of(sequence: Frames, name: str) -> Sequence[int]:
         return frames_used(sequence)
     if name == "lamp":
         return lamp_frames(sequence)
+    if name == "geometry":
+        return sequence.of_kind("target", "sphere")
     kinds = {"stray": "colour", "white": "white", "colour": "colour"}
     return sequence.of_kind(kinds[name])
 
@@ -131,6 +156,12 @@ def _lacks(sequence: Frames, name: str, found: Calibration) -> str | None:
     """Why a stage that may be absent cannot run; None where it can."""
     if name in _NEEDED or name == "lamp":
         return None
+    if name == "geometry":
+        if not sequence.of_kind("target"):
+            return "no frames of kind target"
+        if "board" not in sequence.target:
+            return "sequence.json has no target.board"
+        return None if sequence.rig.get("axes") else "sequence.json has no rig.axes"
     kind = "white" if name == "white" else "colour"
     if not sequence.of_kind(kind):
         return f"no frames of kind {kind}"
@@ -157,6 +188,8 @@ def _made(
         lit, lamp = lamp_factors(sequence, radiometry)
         files = [sequence.frames[i].file for i in lit]
         return Section(inputs, {"files": files, **finite(lamp.record())})
+    if name == "geometry":
+        return Section(inputs, finite(fit_geometry(sequence, radiometry).to_json()))
     stray = None if name == "stray" else stray_of(found)
     scene = Scene(sequence, radiometry, placed, factors_of(sequence, found), stray)
     if name == "stray":

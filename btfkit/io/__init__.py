@@ -19,6 +19,7 @@ from btfkit.errors import FormatError, unknown
 # The order is the order of detection: the more specific first.
 FORMATS: dict[str, str] = {
     "zarr": "btfkit.io.store.reader",
+    "sequence": "btfkit.calibration.captured",
     "axf": "btfkit.io.axf",
     "manifest": "btfkit.io.manifest.reader",
     "spectral": "btfkit.io.spectral",

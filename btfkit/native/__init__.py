@@ -18,6 +18,7 @@ KERNELS: tuple[str, ...] = (
     "draw",
     "factors",
     "prepare",
+    "resample",
 )
 
 

@@ -1,0 +1,201 @@
+"""A camera from views of a board, each view with a pose of its own.
+
+OpenCV's solver starts it; corners are then fitted again with the model, since OpenCV puts them
+where a homography that knows no distortion expects them, and what does not fit is rejected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit.calibration.board import Board
+from btfkit.calibration.camera_model import PARAMETERS, Camera
+from btfkit.calibration.kinematics import Rigid
+from btfkit.errors import CalibrationError
+
+Floats = NDArray[np.float64]
+# Residuals beyond this many robust standard deviations are no noise.
+_REJECT = 5.0
+# A robust spread below this is the arithmetic's, not the detector's, px.
+_LEAST_PX = 0.01
+_FEWEST_VIEWS = 3
+_ROUNDS = 2
+# Views whose boards are more nearly parallel than this tell no focal length.
+_LEAST_TILT_DEG = 5.0
+# Relative standard deviation above which a focal length is not known.
+_FOCAL_SD = 0.01
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class View:
+    """The corners of a board in one frame.
+
+    Attributes:
+        numbers: (k,) corners of the board. pixels: (k, 2) where they are.
+        pose: board to camera.
+    """
+
+    numbers: NDArray[np.intp]
+    pixels: Floats
+    pose: Rigid
+
+    def keep(self, mask: NDArray[np.bool_]) -> View:
+        return replace(self, numbers=self.numbers[mask], pixels=self.pixels[mask])
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class SingleCamera:
+    """What views of a board tell of a camera.
+
+    Attributes:
+        camera: the estimate. sd: (9,) standard deviations of its parameters.
+        views: one a frame, None where the board was not found.
+        residual_px: rms of what was kept. rejected: corners that did not fit.
+        blur_px: standard deviation of the lens's blur that corners were fitted with.
+    """
+
+    camera: Camera
+    sd: Floats
+    views: tuple[View | None, ...]
+    residual_px: float
+    rejected: int
+    blur_px: float
+
+
+def calibrate_camera(
+    images: Sequence[Floats], board: Board, *, blur_px: float | None = None
+) -> SingleCamera:
+    """A camera and the poses of a board in its frames.
+
+    k3 is held at 0: a board rarely reaches where k2 and k3 differ.
+
+    Args:
+        images: (h, w) linear frames of one camera with the board in view.
+        board: what is seen.
+        blur_px: standard deviation of the lens's blur, beside the pixel's own square; None
+            measures it on the view that looks at the board most squarely.
+
+    Raises:
+        CalibrationError: fewer than three frames show the board, or their views are too alike.
+    """
+    found = [board.detect(image) for image in images]
+    usable = [i for i, (numbers, _) in enumerate(found) if len(numbers)]
+    if len(usable) < _FEWEST_VIEWS:
+        raise CalibrationError(
+            f"the board is seen in {len(usable)} of {len(images)} frames; "
+            f"at least {_FEWEST_VIEWS} are needed",
+            remedy="check target.board of sequence.json and the exposure of the target frames",
+        )
+    height, width = images[0].shape
+    blank = Rigid.identity()
+    views = [View(*found[i], blank) for i in usable]
+    camera, views, sd = _solve(views, board, width, height)
+    _refuse_parallel(views)
+    camera, views, sd, rejected = _settled(views, board, width, height)
+    if blur_px is None:
+        square = int(np.argmax([abs(view.pose.rotation[2, 2]) for view in views]))
+        seen = views[square]
+        blur_px = board.blur(images[usable[square]], seen.numbers, camera, seen.pose)
+    every = np.arange(len(board.corners_mm))
+    for turn in range(_ROUNDS):
+        # All corners that frames may show, those that detection missed among them; then the good.
+        views = [
+            _refined(images[i], view, every if turn == 0 else view.numbers, board, camera, blur_px)
+            for i, view in zip(usable, views, strict=True)
+        ]
+        camera, views, sd, rejected = _settled(views, board, width, height)
+    if max(sd[:2] / camera.parameters[:2]) > _FOCAL_SD:
+        raise CalibrationError(
+            f"the focal length comes as {camera.parameters[0]:.1f} ± {sd[0]:.1f} px: the views are "
+            "too alike",
+            remedy="add views tilted by 30 degrees and more, about two axes",
+        )
+    residual = np.concatenate([_residuals(camera, view, board) for view in views])
+    rms = float(np.sqrt((residual**2).sum(1).mean()))
+    by_frame: list[View | None] = [None] * len(images)
+    for i, view in zip(usable, views, strict=True):
+        by_frame[i] = view
+    return SingleCamera(camera, sd, tuple(by_frame), rms, rejected, blur_px)
+
+
+def _refined(
+    image: Floats,
+    view: View,
+    numbers: NDArray[np.intp],
+    board: Board,
+    camera: Camera,
+    blur_px: float,
+) -> View:
+    """The view with corners fitted to the frame, those of `numbers` that it shows."""
+    pixels = board.refine(image, numbers, camera, view.pose, blur_px=blur_px)
+    good = np.isfinite(pixels).all(axis=1)
+    if good.sum() < 4:
+        return view
+    return View(numbers[good], pixels[good], view.pose)
+
+
+def _settled(
+    views: list[View], board: Board, width: int, height: int
+) -> tuple[Camera, list[View], Floats, int]:
+    """Solve, reject what is far off, solve again, until nothing is."""
+    before = sum(len(view.numbers) for view in views)
+    while True:
+        camera, views, sd = _solve(views, board, width, height)
+        residuals = [np.abs(_residuals(camera, view, board)).max(axis=1) for view in views]
+        spread = max(1.4826 * float(np.median(np.concatenate(residuals))), _LEAST_PX)
+        keep = [r < _REJECT * spread for r in residuals]
+        # A view is not taken below what gives its pose: four corners.
+        keep = [k if k.sum() >= 4 else np.ones_like(k) for k in keep]
+        if all(k.all() for k in keep):
+            break
+        views = [view.keep(k) for view, k in zip(views, keep, strict=True)]
+    return camera, views, sd, before - sum(len(view.numbers) for view in views)
+
+
+def _solve(
+    views: list[View], board: Board, width: int, height: int
+) -> tuple[Camera, list[View], Floats]:
+    import cv2
+
+    objects = [board.corners_mm[view.numbers].astype(np.float32) for view in views]
+    pixels = [view.pixels.astype(np.float32) for view in views]
+    try:
+        _, matrix, numbers, turns, shifts, deviations, _, _ = cv2.calibrateCameraExtended(
+            objects, pixels, (width, height), None, None, flags=cv2.CALIB_FIX_K3
+        )
+    except cv2.error as error:
+        raise CalibrationError(
+            f"OpenCV finds no camera for {len(views)} views of the board: {error.err}",
+            remedy="add views tilted by 30 degrees and more, about two axes",
+        ) from error
+    values = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *numbers.reshape(-1)[:5]]
+    camera = Camera(width, height, np.array(values))
+    poses = [
+        Rigid.from_vectors(turn.reshape(3), shift.reshape(3))
+        for turn, shift in zip(turns, shifts, strict=True)
+    ]
+    views = [replace(view, pose=pose) for view, pose in zip(views, poses, strict=True)]
+    return camera, views, np.asarray(deviations, float).reshape(-1)[: len(PARAMETERS)]
+
+
+def _residuals(camera: Camera, view: View, board: Board) -> Floats:
+    return camera.project(view.pose(board.corners_mm[view.numbers])) - view.pixels
+
+
+def _refuse_parallel(views: list[View]) -> None:
+    normals = np.stack([view.pose.rotation[:, 2] for view in views])
+    cosines = np.clip(normals @ normals.T, -1, 1)
+    widest = float(np.degrees(np.arccos(cosines.min())))
+    if widest < _LEAST_TILT_DEG:
+        raise CalibrationError(
+            f"the board stands within {widest:.1f} degrees of parallel in all {len(views)} views; "
+            "focal length and distance cannot be told apart",
+            remedy="add views tilted by 30 degrees and more, or give the camera in sequence.json",
+        )

@@ -1,0 +1,87 @@
+"""The whole loop on the twin: capture, calibrate, ingest; against what its tracer knows as true."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("btfkit.devices.twin", reason="no twin in this installation")
+
+from btfkit.devices.capture import plan as plans
+from btfkit.devices.capture.run import measure
+from btfkit.devices.faults import Faults
+from btfkit.devices.twin.log import Twin, TwinLog
+from btfkit.devices.twin.truth import truth
+
+import btfkit
+from btfkit.calibration import folders
+from btfkit.devices import mock
+
+EDGE = 6
+
+
+def expected(fine, blur):
+    """Texels (h, w, c) of twice the size under the blur that a texture states.
+
+    Args:
+        fine: (2h, 2w, c) traced with a footprint of half a fine texel.
+        blur: (3,) covariance in texels^2 (uu, uv, vv), larger than a fine texel's.
+    """
+    h, w, c = fine.shape
+    # Beside what is asked: the tracer's own half texel, and the mean of two by two.
+    add = 4 * blur - [0.5, 0, 0.5]
+    y, x = 2 * np.pi * np.fft.fftfreq(2 * h)[:, None], 2 * np.pi * np.fft.fftfreq(2 * w)
+    kernel = np.exp(-0.5 * (add[0] * x**2 + 2 * add[1] * x * y + add[2] * y**2))
+    wide = np.pad(fine, ((h // 2, h // 2), (w // 2, w // 2), (0, 0)), mode="reflect")
+    blurred = np.fft.ifft2(np.fft.fft2(wide, axes=(0, 1)) * kernel[..., None], axes=(0, 1)).real
+    inner = blurred[h // 2 : h // 2 + h, w // 2 : w // 2 + w]
+    return inner.reshape(h // 2, 2, w // 2, 2, c).mean((1, 3))
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory):
+    """Twelve pairs of the twin with all that is wrong with it, and three faults on the way."""
+    run = tmp_path_factory.mktemp("twin") / "run"
+    document = {"name": "small", "views": 4, "lights": 3, "reference_every": 30, "whites": 3,
+                "colours": 1, "targets": 16, "spheres": 8}  # fmt: skip
+    log = TwinLog(run, Twin(sample="woven", width=640, height=480, seed=5))
+    faults = Faults(("no-reply:1", "bad-crc:1", "dropped-frame:1"), seed=3)
+    rig = mock.open_rig(log.begin(), faults=faults, log=log)
+    measure(rig, plans.from_document("small", document), run, faults=faults, synthetic=True)
+    folders.calibrate_sequence(run, None, force=False, progress=lambda done, total: None)
+    return run
+
+
+@pytest.mark.slow
+def test_a_captured_btf_matches_the_tracer_at_its_stated_footprint_to_forty_decibels(captured):
+    true = truth(captured)
+    btf = btfkit.open(captured, texel_mm=2 * true.texel_mm)
+    assert btf.shape == (12, 64, 64, 3)
+    by_view = {}
+    for pair in range(len(btf)):
+        found = btf.texture(pair)
+        blur = np.nanmean(btf.textures.footprints(pair).blur, (0, 1))
+        wanted = expected(true.texture(pair).astype(float), blur)
+        inner = slice(EDGE, -EDGE), slice(EDGE, -EDGE)
+        seen = np.isfinite(found[inner])
+        # Hot pixels of the sensor are left out, and no more.
+        assert seen.mean() > 0.98
+        off = np.log1p(np.maximum(found, -0.5))[inner] - np.log1p(wanted)[inner]
+        tilt = round(float(np.degrees(np.arccos(true.view[pair, 2]))))
+        by_view.setdefault(tilt, []).append((off[seen] ** 2).mean())
+        # The scale is absolute: white reference, lamp's distance and colours included.
+        assert np.nanmean(found[inner]) / wanted[inner].mean() == pytest.approx(1, abs=0.02)
+    figures = {tilt: -10 * np.log10(np.mean(each)) for tilt, each in by_view.items()}
+    assert -10 * np.log10(np.mean(list(by_view.values()))) >= 40, figures
+    assert min(figures.values()) > 38, figures
+
+
+@pytest.mark.slow
+def test_directions_of_a_captured_btf_are_those_that_the_twin_really_had(captured):
+    true, btf = truth(captured), btfkit.open(captured)
+
+    def apart(one, other):
+        one, other = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (one, other))
+        return np.degrees(np.linalg.norm(np.cross(one.astype(float), other), axis=1))
+
+    assert apart(btf.view_position, true.view_position).max() < 0.03
+    # The lamp is told by the mirror spheres' highlights alone, of 39 px radius in this sensor.
+    assert apart(btf.light_position, true.light_position).max() < 0.15
