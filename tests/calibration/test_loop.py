@@ -5,15 +5,14 @@ import pytest
 
 pytest.importorskip("btfkit.devices.twin", reason="no twin in this installation")
 
+import btfkit
+from btfkit.calibration import folders
+from btfkit.devices import mock
 from btfkit.devices.capture import plan as plans
 from btfkit.devices.capture.run import measure
 from btfkit.devices.faults import Faults
 from btfkit.devices.twin.log import Twin, TwinLog
 from btfkit.devices.twin.truth import truth
-
-import btfkit
-from btfkit.calibration import folders
-from btfkit.devices import mock
 
 EDGE = 6
 
