@@ -184,6 +184,14 @@ class CapturedTextures(Textures):
         self._waiting: OrderedDict[int, Array] = OrderedDict()
         self._lock = threading.Lock()
 
+    def __getstate__(self) -> dict[str, Any]:
+        # What is at hand belongs to the process that read it.
+        return {**self.__dict__, "_views": OrderedDict(), "_waiting": OrderedDict(), "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._lock = threading.Lock()
+
     def variance(self) -> Textures:
         """The variances of these textures, each at hand after its texture was asked for."""
         return _Variances(self)
