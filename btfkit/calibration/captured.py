@@ -184,6 +184,15 @@ class CapturedTextures(Textures):
         self._waiting: OrderedDict[int, Array] = OrderedDict()
         self._lock = threading.Lock()
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Another process keeps what it reads for itself.
+        return {n: v for n, v in self.__dict__.items() if n not in ("_lock", "_views", "_waiting")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._views, self._waiting = OrderedDict(), OrderedDict()
+        self._lock = threading.Lock()
+
     def variance(self) -> Textures:
         """The variances of these textures, each at hand after its texture was asked for."""
         return _Variances(self)
