@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from threading import Lock
 from typing import Any, final
 
 import numpy as np
@@ -41,7 +40,6 @@ class Chunks:
         self._run = (array.shards or array.chunks)[0]
         self._path = shard_path
         self._indices: dict[int, NDArray[np.uint64]] = {}
-        self._lock = Lock()
 
     def read(self, index: int) -> Array:
         """(h, w, c) texture `index`.
@@ -63,13 +61,14 @@ class Chunks:
         return values.reshape(self._shape).astype(np.float32)
 
     def _index(self, shard: int, file: Any) -> NDArray[np.uint64]:
-        with self._lock:
-            if shard not in self._indices:
-                size = self._run * _ENTRY_BYTES + _CRC_BYTES
-                end = os.fstat(file.fileno()).st_size
-                table = _checked(_read(file, size, max(end - size, 0)))
-                self._indices[shard] = np.frombuffer(table, "<u8").reshape(-1, 2)
-            return self._indices[shard]
+        # Without a lock, which would go neither to another process nor safely through a fork: who
+        # comes second reads the same once more.
+        if shard not in self._indices:
+            size = self._run * _ENTRY_BYTES + _CRC_BYTES
+            end = os.fstat(file.fileno()).st_size
+            table = _checked(_read(file, size, max(end - size, 0)))
+            self._indices[shard] = np.frombuffer(table, "<u8").reshape(-1, 2)
+        return self._indices[shard]
 
 
 def are_ours(array: zarr.Array[Any]) -> bool:

@@ -116,6 +116,10 @@ class StoreTextures(Textures):
         self._chunks = Chunks(array, self._shard) if are_ours(array) else None
         self._band: tuple[int, Array] | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Another process keeps a band of its own.
+        return {**self.__dict__, "_band": None}
+
     def _shard(self, shard: int) -> Path:
         return shard_path(self._path / self._array.basename, shard)
 
