@@ -660,7 +660,7 @@ def test_a_time_may_be_said_in_parts(text: str, seconds: float) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["ingst", "x"], "no verb 'ingst' (did you mean ingest?); there are ingest, "),
+        (["ingst", "x"], "no verb 'ingst' (did you mean ingest?); there are "),
         (["fit", "wool.btf.zarr", "--model", "neubft"], "(did you mean neubtf?)"),
         (["fit", "wool.btf.zarr", "--model", "pca", "--set", "rnk=3"], "(did you mean rank?)"),
         (["fit", "wool.btf.zarr", "--bugdet", "3s"], "Did you mean one of: '--budget'"),
