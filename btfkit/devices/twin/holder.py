@@ -77,20 +77,22 @@ class Plate:
 
 
 @functools.lru_cache(maxsize=4)
-def _board_drawing(size_mm: tuple[float, float], texels_per_mm: float) -> Image:
+def _board_drawing(size_mm: tuple[float, float], scale: float) -> Image:
     """(H, W, 4) of cloth and board: thousands of modules, the same for every twin."""
-    w, h = (round(side * texels_per_mm) for side in size_mm)
+    w, h = (round(side * scale) for side in size_mm)
     drawing = np.zeros((h, w, 4), np.float32)
     drawing[..., :3] = _CLOTH
     across, down = layout.BOARD
     left, top = -across * layout.SQUARE_MM / 2, down * layout.SQUARE_MM / 2
-    _fill(drawing, texels_per_mm, (left, -left), (-top, top), (_PAPER, _PAPER, _PAPER, 0.0))
-    for x, y, side, ink in board_cells():
-        level = _INK if ink else _PAPER
-        _fill(
-            drawing, texels_per_mm, (left + x, left + x + side), (top - y - side, top - y),
-            (level, level, level, 0.0),
-        )  # fmt: skip
+    _fill(drawing, scale, (left, -left), (-top, top), (_PAPER, _PAPER, _PAPER, 0.0))
+    # Summed, not painted one over the other: texels on a border that two squares of ink share
+    # would keep some paper, and borders would move towards the square that was painted last.
+    inked = np.zeros((h, w), np.float32)
+    for x, y, side in inked_squares():
+        cols, over = _covered(w, (left + x) * scale + w / 2, (left + x + side) * scale + w / 2)
+        rows, under = _covered(h, h / 2 - (top - y) * scale, h / 2 - (top - y - side) * scale)
+        inked[rows, cols] += under[:, None] * over
+    drawing[..., :3] += inked[..., None] * np.float32(_INK - _PAPER)
     return drawing
 
 
@@ -110,8 +112,8 @@ def _fill(
     part += share * (np.asarray(value, np.float32) - part)
 
 
-def board_cells() -> list[tuple[float, float, float, bool]]:
-    """Squares of the board, then modules of its markers: left, top, side (mm, y down), inked.
+def inked_squares() -> list[tuple[float, float, float]]:
+    """Black squares of the board, then black modules of its markers: left, top, side (mm, y down).
 
     As OpenCV's CharucoBoard of the same numbers has them.
     """
@@ -125,19 +127,16 @@ def board_cells() -> list[tuple[float, float, float, bool]]:
     ):
         left, top = (float(c) for c in np.asarray(corners)[0, :2])
         marked[int(left / layout.SQUARE_MM), int(top / layout.SQUARE_MM)] = (number, left, top)
-    cells: list[tuple[float, float, float, bool]] = []
-    for j in range(down):
-        for i in range(across):
-            ink = (i, j) not in marked
-            cells.append((i * layout.SQUARE_MM, j * layout.SQUARE_MM, layout.SQUARE_MM, ink))
+    found = [
+        (i * layout.SQUARE_MM, j * layout.SQUARE_MM, layout.SQUARE_MM)
+        for j in range(down) for i in range(across) if (i, j) not in marked
+    ]  # fmt: skip
     side = layout.MARKER_MM / modules
     for number, left, top in marked.values():
         bits = dictionary.generateImageMarker(int(number), modules, borderBits=1)
-        for row in range(modules):
-            for col in range(modules):
-                if bits[row, col] == 0:
-                    cells.append((left + col * side, top + row * side, side, True))  # noqa: PERF401
-    return cells
+        black = np.argwhere(np.asarray(bits) == 0)
+        found += [(left + col * side, top + row * side, side) for row, col in black.tolist()]
+    return found
 
 
 def _covered(count: int, low: float, high: float) -> tuple[slice, Image]:

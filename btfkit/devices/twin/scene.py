@@ -25,6 +25,7 @@ GRID = 2
 # Shading of the plate is smooth: it is worked out every fourth pixel or so, and read between.
 _SHADING = 2.0 / 640
 _DARKEST_COSINE = 1e-3
+_DRAWING = 0.75
 
 
 @final
@@ -53,8 +54,9 @@ class Scene:
         self._truth = truth
         self._relief = geometry(relief)
         self._size_mm = (layout.SAMPLE_MM, layout.SAMPLE_MM / relief.aspect)
-        # A drawing about as fine as the rays that read it.
-        self._plate = Plate(nominal["target"], truth, 5 * grid * size[1] / 640 + 2)
+        # A little coarser than the rays that read it, so that they miss no part of a border.
+        fine = _DRAWING * grid * size[1] / layout.SEEN_MM
+        self._plate = Plate(nominal["target"], truth, fine)
         self._spheres = Spheres(truth.spheres)
         self._lamp_mm = imperfections.of("lamp-size", layout.LAMP_RADIUS_MM)
         self._white = layout.WHITE_ANGULAR
