@@ -66,7 +66,19 @@ def detect(path: str | os.PathLike[str]) -> str:
             "; write a manifest.csv (file, light and view angles: docs/formats.md, pose manifests) "
             "or, of one view, an RTI .lp beside them"
         )
+    if away := _links_away(source):
+        what += f"; {away[0]} is a link that leaves the folder, and is not followed"
+        remedy = f"put what it leads to in its place, or name that itself; {remedy}"
     raise FormatError(source, what, remedy=remedy)
+
+
+def _links_away(source: Path) -> list[str]:
+    """Names in a folder that are links to somewhere outside of it."""
+    if not source.is_dir():
+        return []
+    home = source.resolve()
+    links = sorted(path for path in source.iterdir() if path.is_symlink())
+    return [path.name for path in links if not path.resolve().is_relative_to(home)]
 
 
 def _photographs(source: Path) -> int:

@@ -14,6 +14,7 @@ import pytest
 import sources
 
 import btfkit
+import btfkit.io
 from btfkit.errors import FormatError
 from btfkit.ingest import ingest
 from btfkit.io import anglenames, images, spelling
@@ -230,3 +231,11 @@ def test_a_store_inside_its_source_is_none_of_its_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("first", "second"), [("Ä/B.png", "a\u0308/b.PNG"), ("a\\b", "A/B")])
 def test_equal_spellings_have_one_key(first: str, second: str) -> None:
     assert spelling.key(first) == spelling.key(second)
+
+
+def test_a_folder_of_nothing_but_a_link_away_says_so(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "project").mkdir()
+    (tmp_path / "project" / "images").symlink_to("../disk")
+    with pytest.raises(FormatError, match=r"images is a link that leaves the folder, and is not"):
+        btfkit.io.detect(tmp_path / "project")
