@@ -19,6 +19,7 @@ KERNELS: tuple[str, ...] = (
     "factors",
     "prepare",
     "resample",
+    "lobe",
 )
 
 

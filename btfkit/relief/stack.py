@@ -1,0 +1,229 @@
+"""The values of a BTF by texel: what photometric stereo and parallax read, once from the source.
+
+Lengths are in texels here: a place is (column, row), heights are in texel edges, rows run against y.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit import directions
+from btfkit.btf import BTF
+from btfkit.native import trace as tracer
+
+Array = NDArray[np.float32]
+Floats = NDArray[Any]
+Progress = Callable[[int, int], None]
+
+# Bytes that a stack may take, and pairs beyond which more of them tell a texel little.
+_MOST_BYTES = 3 << 29
+_MOST_VIEWS, _MOST_LIGHTS = 32, 48
+# The largest value of an image is a clipped one where so many texels have it, unless half do.
+_CLIPPED_TEXELS, _CLIPPED_SHARE = 4, 0.0005
+_LARGEST = float(np.finfo(np.float16).max)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """Some pairs of a BTF, all values of a texel side by side, sorted by view.
+
+    Attributes:
+        values: (h, w, n, c) float16; NaN where not measured or saturated.
+        pairs: (n,) of the BTF. light, view: (n, 3) unit vectors.
+        light_near, view_near: (n, 3) positions in texels from the centre of the sample, or None.
+        light_of, view_of: (n,) which distinct direction each is.
+        lights, views: (k, 3) distinct directions.
+        wrap: whether the sample tiles.
+        unmeasured, saturated: values left out, of all.
+    """
+
+    values: NDArray[np.float16]
+    pairs: NDArray[np.intp]
+    light: Array
+    view: Array
+    light_near: Array | None
+    view_near: Array | None
+    light_of: NDArray[np.intp]
+    view_of: NDArray[np.intp]
+    lights: Array
+    views: Array
+    wrap: bool
+    unmeasured: int
+    saturated: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(h, w)."""
+        return self.values.shape[0], self.values.shape[1]
+
+    def grey(self) -> NDArray[np.float16]:
+        """(h, w, n, 1) mean of the channels, row by row to spare memory."""
+        if self.values.shape[3] == 1:
+            return self.values
+        out = np.empty((*self.values.shape[:3], 1), np.float16)
+        for row, into in zip(self.values, out, strict=True):
+            into[..., 0] = row.mean(axis=-1, dtype=np.float32)
+        return out
+
+    def of_views(self) -> Iterator[tuple[int, slice]]:
+        """Each view with the run of its pairs."""
+        starts = np.searchsorted(self.view_of, np.arange(len(self.views) + 1))
+        for which in range(len(self.views)):
+            yield which, slice(int(starts[which]), int(starts[which + 1]))
+
+    def seen(self, values: NDArray[np.float16], height: Array, rows: slice) -> Array:
+        """(t, n, c) values of the surface points over the texels of some rows.
+
+        Args:
+            values: (h, w, n, c), `values` or `grey()`.
+            height: (h, w) of the surface, texels: it is seen at place - height x view_xy / view_z.
+            rows: texels in these rows.
+        """
+        h, w = self.size
+        lifted = height[rows].reshape(-1, 1)
+        if not np.any(lifted):
+            return values[rows].reshape(-1, *values.shape[2:]).astype(np.float32)
+        row, col = np.mgrid[rows, :w].reshape(2, -1, 1).astype(np.float32)
+        out = np.empty((len(lifted), *values.shape[2:]), np.float32)
+        for which, run in self.of_views():
+            vx, vy, vz = (float(x) for x in self.views[which])
+            step = 1 / max(vz, 1e-3)
+            out[:, run] = sampled(
+                values[:, :, run], row[:, 0] + lifted[:, 0] * vy * step,
+                col[:, 0] - lifted[:, 0] * vx * step, wrap=self.wrap,
+            )  # fmt: skip
+        return out
+
+    def place(self, height: Array, rows: slice) -> Array:
+        """(t, 3) points of the surface over the texels of some rows, as positions count."""
+        h, w = self.size
+        row, col = np.mgrid[rows, :w].reshape(2, -1).astype(np.float32)
+        x, y = col + 0.5 - w / 2, h / 2 - 0.5 - row
+        return np.stack([x, y, height[rows].reshape(-1)], axis=1).astype(np.float32)
+
+
+def read_stack(btf: BTF, *, progress: Progress | None = None) -> Stack:
+    """Well spread pairs of a BTF, each read once.
+
+    Raises:
+        ValueError: no pair is lit from above the horizon.
+    """
+    chosen = _chosen(btf)
+    lights, light_of = directions.unique(btf.light[chosen])
+    views, view_of = directions.unique(btf.view[chosen])
+    order = np.argsort(view_of, kind="stable")
+    chosen, light_of, view_of = chosen[order], light_of[order], view_of[order]
+    _, h, w, c = btf.shape
+    values = np.empty((h, w, len(chosen), c), np.float16)
+    unmeasured = saturated = 0
+    for start in range(0, len(chosen), 8):
+        run = slice(start, min(start + 8, len(chosen)))
+        images = btf.batch(chosen[run])
+        unmeasured += int((~np.isfinite(images)).any(axis=-1).sum())
+        saturated += _leave_out_clipped(images)
+        values[:, :, run] = images.transpose(1, 2, 0, 3)
+        if progress:
+            progress(run.stop, len(chosen))
+    return Stack(
+        values=values, pairs=chosen, light=btf.light[chosen], view=btf.view[chosen],
+        light_near=_in_texels(btf.light_position, chosen, btf.texel_mm),
+        view_near=_in_texels(btf.view_position, chosen, btf.texel_mm),
+        light_of=light_of, view_of=view_of, lights=lights, views=views,
+        wrap=btf.wrap == "wrap", unmeasured=unmeasured, saturated=saturated,
+    )  # fmt: skip
+
+
+def sampled(values: Floats, row: Floats, col: Floats, *, wrap: bool) -> Array:
+    """(t, ...) values (h, w, ...) at places between texel centres, bilinear."""
+    h, w = values.shape[:2]
+    i, j = np.floor(row).astype(np.intp), np.floor(col).astype(np.intp)
+    tail = (1,) * (values.ndim - 2)
+    a, b = (
+        (part - whole).astype(np.float32).reshape(-1, *tail) for part, whole in ((row, i), (col, j))
+    )
+    out = np.zeros((len(row), *values.shape[2:]), np.float32)
+    for down, across, share in (
+        (0, 0, (1 - a) * (1 - b)), (0, 1, (1 - a) * b), (1, 0, a * (1 - b)), (1, 1, a * b),
+    ):  # fmt: skip
+        r, c = i + down, j + across
+        r, c = (r % h, c % w) if wrap else (np.clip(r, 0, h - 1), np.clip(c, 0, w - 1))
+        out += share * values[r, c]
+    return out
+
+
+def visibility(height: Array, towards: Array, *, wrap: bool) -> NDArray[np.bool_]:
+    """(k, h, w) whether surface points see each of k directions over the relief itself.
+
+    Args:
+        height: (h, w) texels.
+        towards: (k, 3) unit vectors.
+    """
+    h, w = height.shape
+    maps = np.zeros((h, w, 10), np.float32)
+    maps[..., 6:8], maps[..., 9] = 0.5, 1
+    relief = tracer.geometry(np.ascontiguousarray(height, np.float32), maps, wrap=wrap)
+    row, col = np.mgrid[:h, :w].reshape(2, -1)
+    place = np.stack([col, row], axis=1).astype(np.float32)
+    up = np.broadcast_to(np.array([0, 0, 1], np.float32), (h * w, 3))
+    sharp = np.zeros(h * w, np.float32)
+    found = np.empty((len(towards), h, w), bool)
+    for into, ray in zip(found, towards, strict=True):
+        lit = np.broadcast_to(np.asarray(ray, np.float32), (h * w, 3))
+        into[...] = tracer.trace(relief, place, lit, up, sharp).visible.reshape(h, w) > 0
+    return found
+
+
+def _chosen(btf: BTF) -> NDArray[np.intp]:
+    """Pairs lit from above, of spread lights and views where there are many."""
+    good = (btf.light[:, 2] > 0) & (btf.view[:, 2] > 0.05)
+    if not good.any():
+        raise ValueError("no pair is lit from above the horizon")
+    _, h, w, c = btf.shape
+    most = max(_MOST_BYTES // (2 * h * w * c), 1)
+    tables = [directions.unique(d) for d in (btf.light, btf.view)]
+    sizes = [len(table) for table, _ in tables]
+    if int(good.sum()) > min(most, _MOST_VIEWS * _MOST_LIGHTS) and sizes[1] > 1:
+        counts = min(sizes[0], _MOST_LIGHTS), min(sizes[1], _MOST_VIEWS)
+        shrink = min(1.0, (most / (counts[0] * counts[1])) ** 0.5)
+        for (table, which), count in zip(tables, counts, strict=True):
+            good &= np.isin(which, spread(table, max(int(count * shrink), 3)))
+    index: NDArray[np.intp] = np.flatnonzero(good)
+    return index if len(index) <= most else index[:: -(-len(index) // most)]
+
+
+def spread(table: Array, count: int) -> NDArray[np.intp]:
+    """Up to `count` rows of (k, 3) directions far from each other, the most upright first."""
+    chosen = [int(np.argmax(table[:, 2]))]
+    nearest = table @ table[chosen[0]]
+    for _ in range(min(count, len(table)) - 1):
+        chosen.append(int(np.argmin(nearest)))
+        nearest = np.maximum(nearest, table @ table[chosen[-1]])
+    return np.array(chosen)
+
+
+def _leave_out_clipped(images: Array) -> int:
+    """NaN where images (k, h, w, c) are clipped at their largest value; how many texels."""
+    count = 0
+    for image in images:
+        largest = np.nanmax(image) if np.isfinite(image).any() else np.nan
+        at = (image >= min(largest, _LARGEST)).any(axis=-1)
+        share = at.mean()
+        if _CLIPPED_SHARE < share < 0.5 and at.sum() >= _CLIPPED_TEXELS:
+            image[at] = np.nan
+            count += int(at.sum())
+        image[~np.isfinite(image).all(axis=-1)] = np.nan
+    return count
+
+
+def _in_texels(
+    position: Array | None, pairs: NDArray[np.intp], texel_mm: float | None
+) -> Array | None:
+    if position is None or texel_mm is None:
+        return None
+    return (position[pairs] / texel_mm).astype(np.float32)
