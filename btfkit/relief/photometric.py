@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.errors import FitError
-from btfkit.native.lobe import Lobes, Start, fit_lobes
+from btfkit.native.lobe import Lobes, Start, better, fit_lobes
 from btfkit.relief.stack import Stack
 
 Array = NDArray[np.float32]
@@ -192,19 +192,9 @@ def _fitted(stack: Stack, values: Array, weight: Array, place: Array, begin: Arr
             np.full((t, 1), _GLOSS, np.float32),
         )  # fmt: skip
         found = fit_lobes(values, weight, light, view, first, place=place, near=near)
-        best = found if best is None else _better(best, found)
+        best = found if best is None else better(best, found)
     assert best is not None
     return best
-
-
-def _better(one: Lobes, other: Lobes) -> Lobes:
-    """Of two fits of each texel the one that explains more values, better."""
-    with np.errstate(invalid="ignore"):
-        scores = [lobes.deviation / np.maximum(lobes.kept, 1e-6) for lobes in (one, other)]
-        take = scores[1] < scores[0]
-    return Lobes(
-        *(np.where(take.reshape(-1, *(1,) * (a.ndim - 1)), b, a) for a, b in zip(one, other, strict=True))
-    )
 
 
 def _normals(lobes: Lobes, size: tuple[int, int]) -> Normals:

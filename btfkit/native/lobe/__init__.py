@@ -65,6 +65,7 @@ def fit_lobes(
     start: Start,
     *,
     slopes: bool = True,
+    rough: bool = True,
     gloss: bool = True,
     place: Array | None = None,
     near: tuple[bool, bool] = (False, False),
@@ -77,14 +78,14 @@ def fit_lobes(
         weight: (t, m), 0 leaves out.
         light, view: (m, 3) unit vectors, or positions where `near` says so.
         start: where each fit begins, and what it is held to where the data say nothing.
-        slopes, gloss: whether the slopes, and roughness and specular, are fitted or taken as given.
+        slopes, rough, gloss: whether slopes, roughness and specular are fitted or taken as given.
         place: (t, 3) of the texels in the unit of the positions.
         near: whether `light` and `view` are positions.
         rounds: steps tried at most.
     """
     t, m, c = values.shape
     theta = _packed(start)
-    is_free = np.array([slopes, slopes, gloss, *([True, gloss] * c)], np.uint8)
+    is_free = np.array([slopes, slopes, rough, *([True, gloss] * c)], np.uint8)
     prior = np.array(
         [_PRIOR_SLOPE, _PRIOR_SLOPE, _PRIOR_ROUGHNESS, *([_PRIOR_ALBEDO, _PRIOR_GLOSS] * c)],
         np.float32,
@@ -173,6 +174,19 @@ def fit_lobes_plain(
     found[:, 2:] = _variance(now, np.maximum(left, least), prior, free, total)
     found[~enough] = np.nan
     return _unpacked(best.astype(np.float32), found.astype(np.float32))
+
+
+def better(one: Lobes, other: Lobes) -> Lobes:
+    """Of two fits of each texel the one that explains more of its values, better."""
+    with np.errstate(invalid="ignore"):
+        first, second = (f.deviation / np.maximum(f.kept, 1e-6) for f in (one, other))
+        take = second < first
+    return Lobes(
+        *(
+            np.where(take.reshape(-1, *(1,) * (a.ndim - 1)), b, a)
+            for a, b in zip(one, other, strict=True)
+        )
+    )
 
 
 def shaded(lobes: Start | Lobes, light: Array, view: Array) -> Array:
