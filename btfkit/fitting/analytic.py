@@ -25,6 +25,8 @@ Floats = NDArray[Any]
 # What gloss is taken for where data do not say; two starts, since a lobe has two valleys.
 _GLOSS, _ROUGHNESS = 0.04, (0.25, 0.6)
 _MOST_VALUES = 1 << 23
+# Pairs that a texel's lobe is fitted to.
+_MOST_PAIRS = 400
 # Values that a texel needs for half of its confidence, and its deviation in parts of its mean.
 _HALF_COUNT, _HALF_DEVIATION = 8.0, 0.25
 # Slopes steeper than this are no texel's own: the lobe would turn below the plane.
@@ -107,7 +109,7 @@ def fit_maps(
     for name, given, shape in (("normals", normals, (h, w, 3)), ("heights", heights, (h, w))):
         if given is not None and given.shape != shape:
             raise ValueError(f"{name} have shape {given.shape}; expected {shape}")
-    values = read_stack(btf) if stack is None else stack
+    values = _fewer(read_stack(btf) if stack is None else stack)
     flat = np.zeros((h, w), np.float32) if heights is None else heights * np.float32(w)
     seen = None if heights is None else _seen(values, flat)
     step = max(_MOST_VALUES // (w * len(values.pairs) * values.values.shape[3]), 1)
@@ -121,6 +123,16 @@ def fit_maps(
     lobes = Lobes(*(np.concatenate([part[0][k] for part in parts]) for k in range(7)))
     bright, counts = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
     return _maps(lobes, bright, counts, normals, (h, w))
+
+
+def _fewer(stack: Stack) -> Stack:
+    """As many pairs as a lobe needs, drawn at random."""
+    n = len(stack.pairs)
+    if n <= _MOST_PAIRS:
+        return stack
+    keep = np.zeros(n, bool)
+    keep[np.random.default_rng(0).permutation(n)[:_MOST_PAIRS]] = True
+    return stack.subset(keep)
 
 
 def slope_of(normal: Floats) -> Array:

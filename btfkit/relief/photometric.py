@@ -43,7 +43,9 @@ class Normals:
     Attributes:
         slope: (h, w, 2) dz/dx, dz/dy.
         variance: (h, w, 3) of the slopes, xx, xy, yy; infinite where nothing was found.
-        albedo: (h, w) grey diffuse reflectance. deviation: (h, w) robust, of the values.
+        albedo, specular, roughness: (h, w) grey reflectance, as in `Maps`.
+        deviation: (h, w) robust, of the values.
+    specular, roughness: (h, w) of the gloss, grey.
         kept: (h, w) share of the values that the reflectance explains.
         confidence: (h, w) 0..1.
     """
@@ -51,6 +53,8 @@ class Normals:
     slope: Array
     variance: Array
     albedo: Array
+    specular: Array
+    roughness: Array
     deviation: Array
     kept: Array
     confidence: Array
@@ -59,13 +63,20 @@ class Normals:
         """(h, w, 3) unit normals, surface frame."""
         return normal_of(self.slope)
 
+    def lobes(self, rows: slice) -> Start:
+        """The reflectance of the texels in some rows."""
+        return Start(
+            self.slope[rows].reshape(-1, 2), self.roughness[rows].reshape(-1),
+            self.albedo[rows].reshape(-1, 1), self.specular[rows].reshape(-1, 1),
+        )  # fmt: skip
+
 
 def photometric_stereo(
     stack: Stack,
     *,
     height: Array | None = None,
     visible: NDArray[np.bool_] | None = None,
-    start: Array | None = None,
+    start: Normals | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Normals:
     """Normals of every texel from all pairs of a stack.
@@ -75,7 +86,7 @@ def photometric_stereo(
         height: (h, w) of the surface, texels: where each view sees its points; None is flat.
         visible: (n, h, w) where a pair's light and view are known to reach the surface; None
             leaves shadows to the robust error alone.
-        start: (h, w, 2) slopes to begin with; None begins with the window of ranks.
+        start: normals found before to begin with; None begins with the window of ranks.
 
     Raises:
         FitError: lights that cannot tell normals.
@@ -83,14 +94,14 @@ def photometric_stereo(
     check_lights(stack)
     h, w = stack.size
     flat = np.zeros((h, w), np.float32) if height is None else height
-    grey = stack.grey()
+    grey = stack.grey
     parts: list[Lobes] = []
     step = max(_MOST_VALUES // (w * len(stack.pairs)), 1)
     for first in range(0, h, step):
         rows = slice(first, min(first + step, h))
         values = stack.seen(grey, flat, rows)
         weight = _weights(values, visible, rows)
-        begin = None if start is None else start[rows].reshape(-1, 2)
+        begin = None if start is None else start.lobes(rows)
         parts.append(_fitted(stack, values, weight, stack.place(flat, rows), begin))
         if progress:
             progress(rows.stop, h)
@@ -172,7 +183,7 @@ def _weights(values: Array, visible: NDArray[np.bool_] | None, rows: slice) -> A
     return weight
 
 
-def _fitted(stack: Stack, values: Array, weight: Array, place: Array, begin: Array | None) -> Lobes:
+def _fitted(stack: Stack, values: Array, weight: Array, place: Array, begin: Start | None) -> Lobes:
     near = stack.light_near is not None, stack.view_near is not None
     light = stack.light if stack.light_near is None else stack.light_near
     view = stack.view if stack.view_near is None else stack.view_near
@@ -180,9 +191,9 @@ def _fitted(stack: Stack, values: Array, weight: Array, place: Array, begin: Arr
     if near[0]:
         rays = light[None] - place[:, None]
         towards = rays / np.linalg.norm(rays, axis=2, keepdims=True)
-    slope, albedo = rank_window(values[..., 0], weight, towards)
     if begin is not None:
-        slope = begin.astype(np.float32)
+        return fit_lobes(values, weight, light, view, begin, place=place, near=near)
+    slope, albedo = rank_window(values[..., 0], weight, towards)
     t = len(values)
     best: Lobes | None = None
     # A narrow lobe and a wide one are two valleys of the error.
@@ -208,6 +219,8 @@ def _normals(lobes: Lobes, size: tuple[int, int]) -> Normals:
         slope=np.where(lost[:, None], 0, lobes.slope).reshape(*size, 2).astype(np.float32),
         variance=variance.reshape(*size, 3).astype(np.float32),
         albedo=lobes.albedo[:, 0].reshape(size),
+        specular=lobes.specular[:, 0].reshape(size),
+        roughness=lobes.roughness.reshape(size),
         deviation=lobes.deviation.reshape(size),
         kept=kept.reshape(size).astype(np.float32),
         confidence=np.clip(confidence, 0, 1).reshape(size).astype(np.float32),

@@ -6,7 +6,8 @@ Lengths are in texels here: a place is (column, row), heights are in texel edges
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, final
 
 import numpy as np
@@ -23,6 +24,9 @@ Progress = Callable[[int, int], None]
 # Bytes that a stack may take, and pairs beyond which more of them tell a texel little.
 _MOST_BYTES = 3 << 29
 _MOST_VIEWS, _MOST_LIGHTS = 32, 48
+# Of these few views all lights, for normals; of these few lights all views, for parallax. Normals
+# do without views flatter than 60 degrees.
+_NORMAL_VIEWS, _PARALLAX_LIGHTS, _STEEP = 8, 12, 0.5
 # The largest value of an image is a clipped one where so many texels have it, unless half do.
 _CLIPPED_TEXELS, _CLIPPED_SHARE = 4, 0.0005
 _LARGEST = float(np.finfo(np.float16).max)
@@ -62,14 +66,43 @@ class Stack:
         """(h, w)."""
         return self.values.shape[0], self.values.shape[1]
 
+    @cached_property
     def grey(self) -> NDArray[np.float16]:
-        """(h, w, n, 1) mean of the channels, row by row to spare memory."""
+        """(h, w, n, 1) mean of the channels."""
         if self.values.shape[3] == 1:
             return self.values
         out = np.empty((*self.values.shape[:3], 1), np.float16)
+        # Row by row, to spare memory.
         for row, into in zip(self.values, out, strict=True):
             into[..., 0] = row.mean(axis=-1, dtype=np.float32)
         return out
+
+    def subset(self, keep: NDArray[np.bool_]) -> Stack:
+        """The pairs of a mask (n,)."""
+        at = np.flatnonzero(keep)
+        lights, light_of = directions.unique(self.light[at])
+        views, view_of = directions.unique(self.view[at])
+        return replace(
+            self, values=self.values[:, :, at], pairs=self.pairs[at],
+            light=self.light[at], view=self.view[at],
+            light_near=None if self.light_near is None else self.light_near[at],
+            view_near=None if self.view_near is None else self.view_near[at],
+            lights=lights, light_of=light_of, views=views, view_of=view_of,
+        )  # fmt: skip
+
+    def for_normals(self) -> Stack:
+        """All lights of a few upright views."""
+        few = _upright(self.views)
+        return self if len(few) == len(self.views) else self.subset(np.isin(self.view_of, few))
+
+    def for_parallax(self) -> Stack:
+        """All views of a few lights that several of them share."""
+        views = np.zeros((len(self.lights), len(self.views)), bool)
+        views[self.light_of, self.view_of] = True
+        shared = views.sum(axis=1)
+        good = np.flatnonzero(shared >= max(2, int(shared.max()) // 2))
+        few = good[spread(self.lights[good], _PARALLAX_LIGHTS)] if len(good) else good
+        return self.subset(np.isin(self.light_of, few)) if len(few) else self
 
     def of_views(self) -> Iterator[tuple[int, slice]]:
         """Each view with the run of its pairs."""
@@ -81,7 +114,7 @@ class Stack:
         """(t, n, c) values of the surface points over the texels of some rows.
 
         Args:
-            values: (h, w, n, c), `values` or `grey()`.
+            values: (h, w, n, c), `values` or `grey`.
             height: (h, w) of the surface, texels: it is seen at place - height x view_xy / view_z.
             rows: texels in these rows.
         """
@@ -186,15 +219,22 @@ def _chosen(btf: BTF) -> NDArray[np.intp]:
         raise ValueError("no pair is lit from above the horizon")
     _, h, w, c = btf.shape
     most = max(_MOST_BYTES // (2 * h * w * c), 1)
-    tables = [directions.unique(d) for d in (btf.light, btf.view)]
-    sizes = [len(table) for table, _ in tables]
-    if int(good.sum()) > min(most, _MOST_VIEWS * _MOST_LIGHTS) and sizes[1] > 1:
-        counts = min(sizes[0], _MOST_LIGHTS), min(sizes[1], _MOST_VIEWS)
-        shrink = min(1.0, (most / (counts[0] * counts[1])) ** 0.5)
-        for (table, which), count in zip(tables, counts, strict=True):
-            good &= np.isin(which, spread(table, max(int(count * shrink), 3)))
+    (lights, light_of), (views, view_of) = (directions.unique(d) for d in (btf.light, btf.view))
+    if len(views) > 1 and len(lights) > 1 and int(good.sum()) > len(views) + len(lights):
+        wide = spread(lights, _MOST_LIGHTS), spread(views, _MOST_VIEWS)
+        few = wide[0][:_PARALLAX_LIGHTS], _upright(views)
+        all_lights = np.isin(light_of, wide[0]) & np.isin(view_of, few[1])
+        all_views = np.isin(view_of, wide[1]) & np.isin(light_of, few[0])
+        kept = good & (all_lights | all_views)
+        good = kept if kept.any() else good
     index: NDArray[np.intp] = np.flatnonzero(good)
     return index if len(index) <= most else index[:: -(-len(index) // most)]
+
+
+def _upright(views: Array) -> NDArray[np.intp]:
+    """A few views far from each other, none of them flat unless all are."""
+    steep = np.flatnonzero(views[:, 2] >= min(_STEEP, float(views[:, 2].max())))
+    return steep[spread(views[steep], _NORMAL_VIEWS)]
 
 
 def spread(table: Array, count: int) -> NDArray[np.intp]:

@@ -191,6 +191,22 @@ def better(one: Lobes, other: Lobes) -> Lobes:
 
 def shaded(lobes: Start | Lobes, light: Array, view: Array) -> Array:
     """(t, m, c) values of t texels under m pairs (m, 3): what the tracer answers without shadows."""
+    module = native.load("lobe")
+    if module is None:
+        return shaded_plain(lobes, light, view)
+    (t, c), m = lobes.albedo.shape, len(light)
+    rays = [np.ascontiguousarray(d, np.float32) for d in (light, view)]
+    out = np.empty((t, m, c), np.float32)
+    for k in range(c):
+        one = Start(lobes.slope, lobes.roughness, lobes.albedo[:, [k]], lobes.specular[:, [k]])
+        values = np.empty((t, m), np.float32)
+        module.shade(*rays, np.ascontiguousarray(_packed(one)), native.threads(), values)
+        out[..., k] = values
+    return out
+
+
+def shaded_plain(lobes: Start | Lobes, light: Array, view: Array) -> Array:
+    """The same in numpy."""
     theta = _packed(Start(lobes.slope, lobes.roughness, lobes.albedo, lobes.specular))
     t, m, c = len(theta), len(light), lobes.albedo.shape[1]
     rays = (np.broadcast_to(d, (t, m, 3)) for d in (light, view))

@@ -152,14 +152,28 @@ CLONES void add_squares(const float* r, float* square, int n, float scale) {
     for (int i = 0; i < n; ++i) square[i] += scale * r[i] * r[i];
 }
 
-// Sum over a run of pairs of w a b.
-CLONES float product(const float* w, const float* a, const float* b, int n) {
-    float lane[kLanes] = {};
+// Sums over pairs of w J'J (lower triangle, 15) and w J'r (5) for one channel, in one pass.
+CLONES void sums_of(const float* w, const float* r, const float* j0, const float* j1,
+                    const float* j2, const float* j3, const float* j4, int n, float* out) {
+    float lane[20][kLanes] = {};
     for (int i = 0; i < n; i += kLanes)
-        for (int k = 0; k < kLanes; ++k) lane[k] += w[i + k] * a[i + k] * b[i + k];
-    float sum = 0;
-    for (float part : lane) sum += part;
-    return sum;
+        for (int k = 0; k < kLanes; ++k) {
+            const float a = j0[i + k], b = j1[i + k], c = j2[i + k], d = j3[i + k], e = j4[i + k];
+            const float wk = w[i + k], rk = r[i + k];
+            const float wa = wk * a, wb = wk * b, wc = wk * c, wd = wk * d, we = wk * e;
+            lane[0][k] += wa * a;
+            lane[1][k] += wb * a, lane[2][k] += wb * b;
+            lane[3][k] += wc * a, lane[4][k] += wc * b, lane[5][k] += wc * c;
+            lane[6][k] += wd * a, lane[7][k] += wd * b, lane[8][k] += wd * c, lane[9][k] += wd * d;
+            lane[10][k] += we * a, lane[11][k] += we * b, lane[12][k] += we * c;
+            lane[13][k] += we * d, lane[14][k] += we * e;
+            lane[15][k] += wa * rk, lane[16][k] += wb * rk, lane[17][k] += wc * rk;
+            lane[18][k] += wd * rk, lane[19][k] += we * rk;
+        }
+    for (int at = 0; at < 20; ++at) {
+        out[at] = 0;
+        for (float part : lane[at]) out[at] += part;
+    }
 }
 
 // Geman-McClure: weights (1 + x)^-2 of the pairs, and the error, x = square / scale^2.
@@ -244,14 +258,14 @@ struct Texel {
     void normal_equations(double* a, double* g) {
         std::fill(a, a + P * P, 0.), std::fill(g, g + P, 0.);
         for (int c = 0; c < C; ++c) {
-            const float* rows[5] = {jp[c], jq[c], ja[c], jb[c], jf[c]};
             const int slot[5] = {0, 1, 2, 3 + 2 * c, 4 + 2 * c};
-            for (int i = 0; i < 5; ++i) {
-                g[slot[i]] += product(w.data(), rows[i], r[c], pairs.padded) / C;
-                for (int k = 0; k <= i; ++k) {
-                    const double sum = product(w.data(), rows[i], rows[k], pairs.padded) / C;
-                    a[slot[i] * P + slot[k]] += sum;
-                    if (i != k) a[slot[k] * P + slot[i]] += sum;
+            float sums[20];
+            sums_of(w.data(), r[c], jp[c], jq[c], ja[c], jb[c], jf[c], pairs.padded, sums);
+            for (int i = 0, at = 0; i < 5; ++i) {
+                g[slot[i]] += sums[15 + i] / C;
+                for (int k = 0; k <= i; ++k, ++at) {
+                    a[slot[i] * P + slot[k]] += sums[at] / C;
+                    if (i != k) a[slot[k] * P + slot[i]] += sums[at] / C;
                 }
             }
         }
@@ -429,6 +443,30 @@ void fit(In<float> values, In<float> weight, In<float> light, In<float> view, In
         fit_all<3>(q, theta.data(), found.data(), threads);
 }
 
+// Values (t, m, 1) of grey texels (t, 5) under m pairs: the model alone.
+void shade(In<float> light, In<float> view, In<float> theta, int threads, Out<float> values) {
+    const int64_t t = int64_t(theta.size()) / 5;
+    const int m = int(light.size() / 3);
+    require(int64_t(theta.size()) == 5 * t && int64_t(view.size()) == 3 * m, "directions");
+    require(int64_t(values.size()) == t * m, "room for the values");
+    nb::gil_scoped_release release;
+    spread(t, 16, threads, [&](int, int64_t from, int64_t to) {
+        Texel<1> room(m);
+        for (int i = 0; i < m; ++i) {
+            room.pairs.put(i, light.data() + 3 * i, view.data() + 3 * i);
+            room.pairs.value[i] = 0;
+        }
+        room.pairs.close(m, 1);
+        for (int64_t at = from; at < to; ++at) {
+            room.evaluate(theta.data() + 5 * at);
+            std::copy(room.r[0], room.r[0] + m, values.data() + at * m);
+        }
+    });
+}
+
 }  // namespace
 
-NB_MODULE(_lobe, m) { m.def("fit", &fit); }
+NB_MODULE(_lobe, m) {
+    m.def("fit", &fit);
+    m.def("shade", &shade);
+}
