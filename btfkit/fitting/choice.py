@@ -18,7 +18,7 @@ from btfkit.queries import QuerySet
 # Fewer pairs say little about gloss; fewer than the second are told apart by their neighbours.
 _FEW, _SPARSE = 8, 24
 # A structure that moves by less, in texels for each unit of tan(view), is flat.
-_FLAT_TEXELS = 0.02
+FLAT_TEXELS = 0.02
 _BLOCK, _SIGMA = 8, 0.7
 _MOST_VIEWS, _LIGHTS_A_VIEW = 16, 3
 # What a part that is left out would have bought: docs/benchmarks.md, skips; docs/neumip.md.
@@ -88,10 +88,10 @@ def _for_btf(btf: BTF) -> Choice:
         reasons.append(f"no offset stage: there is one view, nothing moves; {_OFFSET}")
         return Choice("neumip", tuple(reasons), settings)
     moved = moving(btf)
-    if moved is not None and moved < _FLAT_TEXELS:
+    if moved is not None and moved < FLAT_TEXELS:
         settings["offset"] = "0"
         reasons.append(
-            f"no offset stage: the structure stays within {_FLAT_TEXELS} texels in all views; "
+            f"no offset stage: the structure stays within {FLAT_TEXELS} texels in all views; "
             + _OFFSET
         )
     elif moved is None:

@@ -1,0 +1,261 @@
+"""The relief that a BTF implies: photometric stereo, parallax, and both in one.
+
+Flat samples and data of one view skip parallax and fusion; the figures say so.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit.btf import BTF
+from btfkit.fitting.analytic import Maps, fit_maps
+from btfkit.fitting.heightfield import orientation
+from btfkit.fitting.heightfield.fusion import Fused, fuse
+from btfkit.fitting.heightfield.parallax import Sweep, disagreement, fitted_heights, reached, sweep
+from btfkit.relief.integration import integrate
+from btfkit.relief.photometric import Normals, check_lights, photometric_stereo
+from btfkit.relief.relief import Relief
+from btfkit.relief.stack import Stack, read_stack, visibility
+
+Array = NDArray[np.float32]
+Progress = Callable[[int, int], None]
+
+# Steps of the sweep, texels: each round looks closer.
+_SWEEPS = (0.5, 0.25, 0.12, 0.08)
+# Rounds of normals and own visibility where there is no parallax.
+_ROUNDS = 2
+# Floor of a slope's error, as in the fusion.
+_SLOPE_ERROR = 0.03
+# Height error at which confidence is a half, texels.
+_HALF_HEIGHT = 0.25
+_MOST_HELD = 12
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A relief and how it was found.
+
+    Attributes:
+        relief: with fitted reflectance maps; heights in tile widths.
+        normals: of photometric stereo.
+        heights: (h, w) of each source in texels: "normals", "parallax", "fusion".
+        deviation: (h, w) expected error of the heights, texels; of normals alone NaN.
+        lit, seen: (h, w) shares of lights and of views that reach the surface.
+        maps: the reflectance. held: pairs of the BTF that nothing was fitted to.
+        figures: what the report states, JSON types.
+    """
+
+    relief: Relief
+    normals: Normals
+    heights: Mapping[str, Array]
+    deviation: Array
+    lit: Array
+    seen: Array
+    maps: Maps
+    held: NDArray[np.intp]
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+
+def find_relief(
+    btf: BTF,
+    *,
+    budget_s: float = 20.0,
+    start: Array | None = None,
+    holdout: float = 0.05,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Found:
+    """The relief of a BTF.
+
+    Args:
+        btf: what was measured.
+        budget_s: wall time for the heights that parallax begins with; the rest takes what it takes.
+        start: (h, w) heights in texels that a model already found; None fits one.
+        holdout: share of the pairs that nothing is fitted to; at most a dozen are kept.
+        seed: of all randomness.
+        progress: called with (done, total).
+
+    Raises:
+        FitError: lights that leave slopes open, directions of the wrong hand, no usable data.
+    """
+    began, cpu = time.perf_counter(), time.process_time()
+    train, held = _split(len(btf), holdout, seed)
+    btf = btf.subset(train)
+    stack = read_stack(btf, progress=progress)
+    check_lights(stack)
+    why = _no_parallax(btf, stack)
+    if why is None:
+        solved = _with_parallax(btf, stack, budget_s, start, seed, progress)
+    else:
+        solved = _from_normals(stack)
+    w = stack.size[1]
+    height = solved.heights[solved.best]
+    lit, seen = (reached(height, d, wrap=stack.wrap) for d in (stack.lights, stack.views))
+    sure = np.isfinite(solved.deviation)
+    confidence = np.where(
+        sure,
+        1 / (1 + np.square(np.where(sure, solved.deviation, 0) / _HALF_HEIGHT)),
+        solved.normals.confidence,
+    )
+    shape = Relief(
+        height=height / np.float32(w), albedo=np.zeros((*stack.size, 3)),
+        specular=np.zeros((*stack.size, 3)), roughness=np.ones(stack.size), wrap=btf.wrap,
+    )  # fmt: skip
+    maps = fit_maps(
+        btf, normals=shape.normals(), heights=shape.height, stack=stack, progress=progress
+    )
+    relief = maps.relief(
+        shape.height, wrap=btf.wrap, texel_mm=btf.texel_mm, channels=btf.channels,
+        confidence=confidence.astype(np.float32), name="heightfield",
+        provenance={"found": "heightfield", "data": dict(btf.provenance), "licence": btf.licence},
+    )  # fmt: skip
+    figures = {
+        "source": solved.best,
+        "skipped": why,
+        "pairs": len(stack.pairs),
+        "lights": len(stack.lights),
+        "views": len(stack.views),
+        "texels": list(stack.size),
+        "curl": solved.curl,
+        "shadowed": float(1 - lit.mean()),
+        "hidden": float(1 - seen.mean()),
+        "saturated": stack.saturated / (math.prod(stack.size) * len(stack.pairs)),
+        "unmeasured": stack.unmeasured / (math.prod(stack.size) * len(stack.pairs)),
+        "unexplained": float(1 - np.mean(solved.normals.kept)),
+        "range_texels": float(np.ptp(height)),
+        "offset_texels": float(height.mean()) if why is None else 0.0,
+        "clipped_albedo": maps.clipped,
+        **solved.figures,
+        "seconds": time.perf_counter() - began,
+        "cpu_seconds": time.process_time() - cpu,
+    }
+    return Found(
+        relief, solved.normals, solved.heights, solved.deviation, lit, seen, maps, held, figures
+    )
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    normals: Normals
+    heights: Mapping[str, Array]
+    best: str
+    deviation: Array
+    curl: float
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+
+def _split(count: int, holdout: float, seed: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    from btfkit.fitting.fit import split
+
+    # Few pairs are all needed.
+    if count < 16 or not holdout:
+        return np.arange(count), np.arange(0)
+    return split(count, min(holdout, _MOST_HELD / count), seed)
+
+
+def _no_parallax(btf: BTF, stack: Stack) -> str | None:
+    """Why parallax says nothing here; None where it does."""
+    from btfkit.fitting.choice import FLAT_TEXELS, moving
+
+    if len(stack.views) == 1:
+        return "parallax and fusion: there is one view, nothing moves; heights have no offset"
+    views = stack.for_parallax()
+    if len(views.views) < 3 or len(views.pairs) <= len(views.lights):
+        return "parallax and fusion: no light is shared by several views"
+    moved = moving(btf)
+    if moved is not None and moved < FLAT_TEXELS:
+        return f"parallax and fusion: the structure moves by less than {FLAT_TEXELS} texels"
+    return None
+
+
+def _from_normals(stack: Stack) -> _Solved:
+    """Heights from slopes alone, solved again with the relief's own shadows."""
+    few = stack.for_normals()
+    visible: NDArray[np.bool_] | None = None
+    normals: Normals | None = None
+    turn = 0.0
+    for round_ in range(_ROUNDS):
+        normals = photometric_stereo(few, visible=visible, start=normals)
+        if round_ == 0:
+            turn = orientation.check_lights(normals, wrap=stack.wrap)
+        whole = integrate(normals.slope, _weights(normals), wrap=stack.wrap)
+        visible = visibility(whole.height, few.lights, wrap=stack.wrap)[few.light_of]
+    assert normals is not None
+    nothing = np.full(stack.size, np.nan, np.float32)
+    figures = {"integration_residual": whole.residual}
+    return _Solved(normals, {"normals": whole.height}, "normals", nothing, turn, figures)
+
+
+def _with_parallax(
+    btf: BTF,
+    stack: Stack,
+    budget_s: float,
+    start: Array | None,
+    seed: int,
+    progress: Progress | None,
+) -> _Solved:
+    few, many = stack.for_normals(), stack.for_parallax()
+    first = photometric_stereo(few)
+    turn = orientation.check_lights(first, wrap=stack.wrap)
+    orientation.check_views(many, first)
+    height = start
+    if height is None:
+        height = fitted_heights(_as_btf(btf, stack), budget_s=budget_s, seed=seed, progress=progress)
+    before = disagreement(many, np.zeros_like(height))
+    heights = {"model": height}
+    found: tuple[Normals, Sweep, Fused] | None = None
+    for step in _SWEEPS:
+        found = _round(few, many, height, step, None if found is None else found[0], seed)
+        height = found[2].height
+    assert found is not None
+    normals, swept, fused = found
+    alone = integrate(normals.slope, _weights(normals), wrap=stack.wrap).height
+    heights |= {"normals": alone + height.mean() - alone.mean(), "parallax": swept.height}
+    heights["fusion"] = height
+    figures = {
+        "disagreement_flat": before,
+        "disagreement": disagreement(many, height, normals),
+        "agreement_texels": {
+            f"{a} - {b}": float(np.sqrt(np.median(np.square(heights[a] - heights[b]))))
+            for a, b in (("normals", "parallax"), ("normals", "fusion"), ("parallax", "fusion"))
+        },
+        "expected_error_texels": float(np.median(fused.deviation)),
+    }
+    return _Solved(normals, heights, "fusion", fused.deviation, turn, figures)
+
+
+def _round(
+    few: Stack, many: Stack, height: Array, step: float, before: Normals | None, seed: int
+) -> tuple[Normals, Sweep, Fused]:
+    """Normals, sweep and fusion around heights, with the relief's own visibility."""
+    lit, looked = (visibility(height, d, wrap=few.wrap) for d in (few.lights, few.views))
+    visible = lit[few.light_of] & looked[few.view_of]
+    normals = photometric_stereo(few, height=height, visible=visible, start=before)
+    swept = sweep(many, height, normals, step=step)
+    fused = fuse(
+        normals.slope, normals.variance[..., [0, 2]], swept.height, swept.variance,
+        wrap=few.wrap, seed=seed,
+    )  # fmt: skip
+    return normals, swept, fused
+
+
+def _weights(normals: Normals) -> Array:
+    return 1 / (normals.variance[..., [0, 2]] + np.float32(_SLOPE_ERROR**2))
+
+
+def _as_btf(btf: BTF, stack: Stack) -> BTF:
+    """The pairs of a stack, which lie in memory already."""
+    textures = np.ascontiguousarray(stack.values.transpose(2, 0, 1, 3))
+    at = stack.pairs
+    return replace(
+        btf.subset(at), textures=textures, validity=None, variance=None,
+    )  # fmt: skip
