@@ -16,6 +16,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "fit": ("btfkit.cli.fit", "Fit a model to a BTF, a relief or a query file."),
     "propagate": ("btfkit.cli.propagate", "Carry a fitted NeuBTF onto a guidance image."),
     "tile": ("btfkit.cli.tile", "Make an image, a BTF or a NeuBTF tile."),
+    "heightfield": ("btfkit.cli.heightfield", "The relief that a BTF implies, or a model has."),
     "eval": ("btfkit.cli.eval", "Errors of a model on a BTF or a query file."),
     "query": ("btfkit.cli.query", "Answer a query file with a model."),
     "render": ("btfkit.cli.render", "A picture of a material on a simple shape."),

@@ -3,7 +3,7 @@
     Z  N.X N.Y N.Z  confidence  albedo.R/G/B  specular.R/G/B
     roughness  roughness_across  tangent  opacity
 
-Attributes, each behind "btfkit:": unit ("tile" or "texel"), texel_mm, offset, wrap, provenance.
+Attributes, each behind "btfkit:": unit ("tile", "texel" or "mm"), texel_mm, offset, wrap, provenance.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from btfkit.io import images
 from btfkit.relief.relief import Relief
 
 _PREFIX = "btfkit:"
+UNITS = ("tile", "texel", "mm")
 _SINGLE = ("confidence", "roughness", "roughness_across", "tangent", "opacity")
 # What a relief from elsewhere is taken for where its file does not say.
 _GREY, _GLOSS, _ROUGH = 0.5, 0.0, 0.5
@@ -39,10 +40,11 @@ def read(path: Path) -> Relief:
         raise FormatError(path, f"no channel Z; it has {', '.join(channels)}")
     h, w = maps["Z"].shape
     unit = str(attributes.get(_PREFIX + "unit", "texel"))
-    if unit not in ("tile", "texel"):
-        raise FormatError(path, f"unit {unit!r}; expected tile or texel")
-    height = maps["Z"] if unit == "tile" else maps["Z"] / np.float32(w)
+    if unit not in UNITS:
+        raise FormatError(path, f"unit {unit!r}; expected {', '.join(UNITS)}")
     try:
+        edge = attributes.get(_PREFIX + "texel_mm")
+        height = maps["Z"] / np.float32(_tile_width(unit, w, None if edge is None else float(edge)))
         provenance = json.loads(attributes.get(_PREFIX + "provenance", "{}"))
         texel_mm = attributes.get(_PREFIX + "texel_mm")
         return Relief(
@@ -76,17 +78,17 @@ def write(
     Args:
         relief: what to write, of three channels.
         path: `*.exr`.
-        unit: of Z in the file: "tile" widths, or "texel" where the scale is not known.
+        unit: of Z in the file: "tile" widths, "texel", or "mm" where the scale is known.
         offset: how far the plane was moved, in the same unit; recorded.
         force: whether an existing file is replaced.
 
     Raises:
-        ValueError: not three channels.
+        ValueError: not three channels, or mm without an edge of a texel.
         FileExistsError: `path` exists and `force` is False.
     """
     if len(relief.channels) != 3:
         raise ValueError(f"relief files hold RGB; the relief has {relief.channels}")
-    scale = 1.0 if unit == "tile" else float(relief.size[1])
+    scale = _tile_width(unit, relief.size[1], relief.texel_mm)
     planes: dict[str, Any] = {"Z": relief.height * np.float32(scale)}
     normals = relief.normals()
     planes |= {f"N.{axis}": normals[..., index] for index, axis in enumerate("XYZ")}
@@ -105,6 +107,13 @@ def write(
     pixels = np.stack(list(planes.values()), axis=-1).astype(np.float32)
     with whole(path, force=force) as partial:
         images.write_exr(partial, pixels, tuple(planes), attributes)
+
+
+def _tile_width(unit: str, w: int, texel_mm: float | None) -> float:
+    """Units to a tile width of w texels."""
+    if unit == "mm" and not texel_mm:
+        raise ValueError("heights in mm need texel_mm, which is not known here")
+    return {"tile": 1.0, "texel": float(w), "mm": w * (texel_mm or 1.0)}[unit]
 
 
 def _coloured(
