@@ -32,7 +32,7 @@ btfkit heightfield wool.neumip.safetensors""",
 @click.option("--budget", type=DurationType(), default="20s", show_default=True,
               help="Time to find heights by parallax; the rest takes what it takes.")  # fmt: skip
 @click.option("--holdout", type=click.FloatRange(0, 1, max_open=True), default=0.05,
-              show_default=True, help="Share of pairs, a dozen at most, kept for the test.")  # fmt: skip
+              show_default=True, help="Share of pairs kept for the test, 12 at most.")  # fmt: skip
 @click.option("--no-preview", is_flag=True, help="No picture beside the relief.")
 @seed_option
 @force_option
@@ -109,13 +109,11 @@ def _found(
     if kind != "btf":
         raise BtfkitError(
             f"{source} is no BTF and no model",
-            remedy="heights come from pictures under known lights: a BTF, or a neumip fitted to one",
+            remedy="heights come from a BTF, or from a neumip fitted to one",
         )
     start = None if model is None else heights_of(btfkit.load(model))
     btf = btfkit.open(source)
-    found = find_relief(
-        btf, budget_s=budget, start=start, holdout=holdout, seed=seed, progress=bar
-    )
+    found = find_relief(btf, budget_s=budget, start=start, holdout=holdout, seed=seed, progress=bar)
     return found, btf
 
 
@@ -129,11 +127,11 @@ def _of_three(relief: Relief) -> Relief:
 
     if len(relief.channels) == 3:
         return relief
-    grey = {
-        name: np.repeat(getattr(relief, name).mean(axis=2, keepdims=True), 3, axis=2)
-        for name in ("albedo", "specular")
-    }
-    return replace(relief, channels=RGB, **grey)
+    albedo, specular = (
+        np.repeat(part.mean(axis=2, keepdims=True), 3, axis=2)
+        for part in (relief.albedo, relief.specular)
+    )
+    return replace(relief, channels=RGB, albedo=albedo, specular=specular)
 
 
 def _line(final: Path, figures: dict[str, Any]) -> str:

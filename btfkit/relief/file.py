@@ -3,7 +3,7 @@
     Z  N.X N.Y N.Z  confidence  albedo.R/G/B  specular.R/G/B
     roughness  roughness_across  tangent  opacity
 
-Attributes, each behind "btfkit:": unit ("tile", "texel" or "mm"), texel_mm, offset, wrap, provenance.
+Attributes, each behind "btfkit:": unit ("tile", "texel", "mm"), texel_mm, offset, wrap, provenance.
 """
 
 from __future__ import annotations

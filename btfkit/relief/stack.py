@@ -1,6 +1,6 @@
-"""The values of a BTF by texel: what photometric stereo and parallax read, once from the source.
+"""The values of a BTF by texel: what photometric stereo and parallax read, once.
 
-Lengths are in texels here: a place is (column, row), heights are in texel edges, rows run against y.
+Lengths are in texels: a place is (column, row), heights count texel edges, rows run against y.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class Stack:
             height: (h, w) of the surface, texels: it is seen at place - height x view_xy / view_z.
             rows: texels in these rows.
         """
-        h, w = self.size
+        w = self.size[1]
         lifted = height[rows].reshape(-1, 1)
         if not np.any(lifted):
             return values[rows].reshape(-1, *values.shape[2:]).astype(np.float32)

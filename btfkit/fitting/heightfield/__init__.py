@@ -14,21 +14,23 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.btf import BTF
+from btfkit.btf import BTF, Wrap
 from btfkit.fitting.analytic import Maps, fit_maps
 from btfkit.fitting.heightfield import orientation
+from btfkit.fitting.heightfield.bounds import shadow_bounds
 from btfkit.fitting.heightfield.fusion import Fused, fuse
 from btfkit.fitting.heightfield.parallax import Sweep, disagreement, fitted_heights, reached, sweep
 from btfkit.relief.integration import integrate
 from btfkit.relief.photometric import Normals, check_lights, photometric_stereo
 from btfkit.relief.relief import Relief
 from btfkit.relief.stack import Stack, read_stack, visibility
+from btfkit.textures import as_textures
 
 Array = NDArray[np.float32]
 Progress = Callable[[int, int], None]
 
 # Steps of the sweep, texels: each round looks closer.
-_SWEEPS = (0.5, 0.25, 0.12, 0.08)
+_SWEEPS = (1.0, 0.5, 0.25, 0.12)
 # Rounds of normals and own visibility where there is no parallax.
 _ROUNDS = 2
 # Floor of a slope's error, as in the fusion.
@@ -105,10 +107,7 @@ def find_relief(
         1 / (1 + np.square(np.where(sure, solved.deviation, 0) / _HALF_HEIGHT)),
         solved.normals.confidence,
     )
-    shape = Relief(
-        height=height / np.float32(w), albedo=np.zeros((*stack.size, 3)),
-        specular=np.zeros((*stack.size, 3)), roughness=np.ones(stack.size), wrap=btf.wrap,
-    )  # fmt: skip
+    shape = bare(height, wrap=btf.wrap)
     maps = fit_maps(
         btf, normals=shape.normals(), heights=shape.height, stack=stack, progress=progress
     )
@@ -223,7 +222,7 @@ def _with_parallax(
     heights["fusion"] = height
     figures = {
         "disagreement_flat": before,
-        "disagreement": disagreement(many, height, normals),
+        "disagreement": disagreement(many, height),
         "agreement_texels": {
             f"{a} - {b}": float(np.sqrt(np.median(np.square(heights[a] - heights[b]))))
             for a, b in (("normals", "parallax"), ("normals", "fusion"), ("parallax", "fusion"))
@@ -243,19 +242,24 @@ def _round(
     swept = sweep(many, height, normals, step=step)
     fused = fuse(
         normals.slope, normals.variance[..., [0, 2]], swept.height, swept.variance,
-        wrap=few.wrap, seed=seed,
+        wrap=few.wrap, bounds=shadow_bounds(few, height, normals), seed=seed,
     )  # fmt: skip
     return normals, swept, fused
 
 
 def _weights(normals: Normals) -> Array:
-    return 1 / (normals.variance[..., [0, 2]] + np.float32(_SLOPE_ERROR**2))
+    by = 1 / (normals.variance[..., [0, 2]] + _SLOPE_ERROR**2)
+    return by.astype(np.float32)
 
 
 def _as_btf(btf: BTF, stack: Stack) -> BTF:
     """The pairs of a stack, which lie in memory already."""
-    textures = np.ascontiguousarray(stack.values.transpose(2, 0, 1, 3))
-    at = stack.pairs
-    return replace(
-        btf.subset(at), textures=textures, validity=None, variance=None,
-    )  # fmt: skip
+    textures = as_textures(np.ascontiguousarray(stack.values.transpose(2, 0, 1, 3)))
+    return replace(btf.subset(stack.pairs), textures=textures, validity=None, variance=None)
+
+
+def bare(height: Array, *, wrap: Wrap) -> Relief:
+    """The relief of heights (h, w) in texels, black."""
+    h, w = height.shape
+    black, rough = np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32)
+    return Relief(height / np.float32(w), black, black, rough, wrap=wrap)

@@ -13,6 +13,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.fitting.heightfield.bounds import Bounds
 from btfkit.relief.integration import System, softened, system_of
 
 Array = NDArray[np.float32]
@@ -23,7 +24,11 @@ _ROUNDS = 4
 _SLOPE_ERROR = 0.03
 # A height so many deviations off counts half.
 _HALF = 2.5
+# Deviation of a bound: shadows' edges are as soft as a footprint.
+_BOUND = 0.3
 _SAMPLES = 6
+# Median of a squared normal number of variance 1; and no source gains more than this.
+_MEDIAN_SQUARE, _LEAST_SCALE = 0.4549, 0.3
 
 
 @final
@@ -48,6 +53,7 @@ def fuse(
     height_variance: Floats,
     *,
     wrap: bool,
+    bounds: Bounds | None = None,
     seed: int = 0,
 ) -> Fused:
     """The surface that slopes and heights agree on best.
@@ -56,6 +62,7 @@ def fuse(
         slope: (h, w, 2) dz/dx, dz/dy. slope_variance: (h, w, 2) of each; infinite where unknown.
         height: (h, w) texels. height_variance: (h, w); infinite where unknown.
         wrap: whether the surface tiles. seed: of the deviation's samples.
+        bounds: that shadows set; a height beyond one is drawn back to it.
     """
     by_slope = 1 / (np.maximum(slope_variance, 0) + _SLOPE_ERROR**2)
     by_height = 1 / np.maximum(height_variance, 1e-6)
@@ -64,14 +71,47 @@ def fuse(
     for _ in range(_ROUNDS):
         found, taken = now.solve(now.right(), found)
         steps += taken
-        now = _softened(base, found)
+        base = _reweighted(base, found)
+        now = _bounded(_softened(base, found), found, bounds)
     return Fused(found.astype(np.float32), _deviation(now, found, seed), steps)
+
+
+def _reweighted(system: System, height: Floats) -> System:
+    """Each source's variances scaled to what its equations leave: neither is as sure as it says.
+
+    Source: variance components, Foerstner 1979; by medians, which outliers leave alone.
+    """
+    rx, ry = system.residuals(height)
+    slopes = np.concatenate(
+        [(system.by_across * rx**2).reshape(-1), (system.by_down * ry**2).reshape(-1)]
+    )
+    heights = (system.by_known * np.square(height - system.known))[system.by_known > 1e-6]
+    scale = [
+        max(float(np.median(part)) / _MEDIAN_SQUARE, _LEAST_SCALE) if part.size else 1.0
+        for part in (slopes, heights)
+    ]
+    return replace(
+        system, by_across=system.by_across / scale[0], by_down=system.by_down / scale[0],
+        by_known=system.by_known / scale[1],
+    )  # fmt: skip
 
 
 def _softened(system: System, height: Floats) -> System:
     """Less weight for what stands out, of slopes (steps) and of heights (wrong matches)."""
     known = system.by_known * np.square(height - system.known) / _HALF**2
     return replace(softened(system, height), by_known=system.by_known / (1 + known))
+
+
+def _bounded(system: System, height: Floats, bounds: Bounds | None) -> System:
+    """The same equations, and those of the bounds that a surface breaks."""
+    if bounds is None:
+        return system
+    low, high = height < bounds.lower, height > bounds.upper
+    at = np.where(low, bounds.lower, np.where(high, bounds.upper, 0.0))
+    by = np.where(low | high, 1 / _BOUND**2, 0.0)
+    both = system.by_known + by
+    known = (system.by_known * system.known + by * at) / np.maximum(both, 1e-30)
+    return replace(system, known=known, by_known=both)
 
 
 def _deviation(system: System, height: Floats, seed: int) -> Array:

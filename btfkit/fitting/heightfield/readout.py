@@ -10,14 +10,12 @@ import numpy as np
 
 from btfkit import directions
 from btfkit.btf import BTF
-from btfkit.fitting.analytic import fit_maps
-from btfkit.fitting.heightfield import Found
+from btfkit.fitting.analytic import fit_maps, slope_of
+from btfkit.fitting.heightfield import Found, bare
 from btfkit.fitting.heightfield.parallax import heights_of, reached
 from btfkit.materials.base import Material
 from btfkit.materials.evaluation import texel_centres
 from btfkit.relief.photometric import Normals
-from btfkit.fitting.analytic import slope_of
-from btfkit.relief.relief import Relief
 from btfkit.relief.stack import spread
 from btfkit.textures import Array, Textures
 
@@ -71,19 +69,16 @@ def read_out(
         material, table[spread(table, _LIGHTS)], table[spread(table[:37], _VIEWS)]
     )  # fmt: skip
     seen = reached(height, table, wrap=material.header.wrap == "wrap")
-    bare = Relief(
-        height=height / np.float32(w), albedo=np.zeros((h, w, 3)), specular=np.zeros((h, w, 3)),
-        roughness=np.ones((h, w)), wrap=material.header.wrap,
-    )  # fmt: skip
-    maps = fit_maps(btf, normals=bare.normals(), heights=bare.height, progress=progress)
+    shape = bare(height, wrap=material.header.wrap)
+    maps = fit_maps(btf, normals=shape.normals(), heights=shape.height, progress=progress)
     relief = maps.relief(
-        bare.height, wrap=btf.wrap, texel_mm=btf.texel_mm, channels=btf.channels,
+        shape.height, wrap=btf.wrap, texel_mm=btf.texel_mm, channels=btf.channels,
         confidence=seen, name="heightfield",
         provenance={"found": f"heights of a {material.model}", "data": dict(btf.provenance)},
     )  # fmt: skip
     nothing = np.full((h, w), np.nan, np.float32)
     normals = Normals(
-        slope=slope_of(bare.normals()), variance=np.full((h, w, 3), np.inf, np.float32),
+        slope=slope_of(shape.normals()), variance=np.full((h, w, 3), np.inf, np.float32),
         albedo=maps.albedo.mean(axis=2), specular=maps.specular.mean(axis=2),
         roughness=maps.roughness, deviation=maps.deviation, kept=maps.confidence, confidence=seen,
     )  # fmt: skip

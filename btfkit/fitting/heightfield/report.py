@@ -17,7 +17,7 @@ from btfkit.fitting.heightfield import Found
 from btfkit.jsonvalues import plain
 from btfkit.materials.evaluation import answer_pair
 from btfkit.relief import pictures
-from btfkit.relief.material import TracedRelief
+from btfkit.relief.material import TracedRelief, TracedSpec
 
 _SHOWN = 3
 
@@ -79,7 +79,7 @@ def _maps(found: Found) -> bytes:
 
 
 def _compared(found: Found, btf: BTF) -> bytes:
-    material = TracedRelief(found.relief)
+    material = TracedRelief(found.relief, TracedSpec(samples=1))
     pairs = found.held if len(found.held) else np.arange(len(btf))
     images = []
     for pair in pairs[:: max(len(pairs) // _SHOWN, 1)][:_SHOWN]:

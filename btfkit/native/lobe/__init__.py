@@ -83,7 +83,7 @@ def fit_lobes(
         near: whether `light` and `view` are positions.
         rounds: steps tried at most.
     """
-    t, m, c = values.shape
+    t, _, c = values.shape
     theta = _packed(start)
     is_free = np.array([slopes, slopes, rough, *([True, gloss] * c)], np.uint8)
     prior = np.array(
@@ -91,11 +91,16 @@ def fit_lobes(
         np.float32,
     )
     places = np.zeros((t, 3), np.float32) if place is None else place
-    parts = [np.ascontiguousarray(a, np.float32) for a in (values, weight, light, view, places)]
+    parts = tuple(
+        np.ascontiguousarray(a, np.float32) for a in (values, weight, light, view, places)
+    )
     floor = _least_deviation(parts[0], parts[1])
     module = native.load("lobe")
     if module is None or c not in (1, 3):
-        return fit_lobes_plain(*parts, theta, prior, floor, is_free, near=near, rounds=rounds)
+        y, by, lit, seen, at = parts
+        return fit_lobes_plain(
+            y, by, lit, seen, at, theta, prior, floor, is_free, near=near, rounds=rounds
+        )
     found = np.empty((t, 5), np.float32)
     module.fit(*parts, prior, floor, is_free, *near, rounds, native.threads(), theta, found)
     return _unpacked(theta, found)
@@ -117,17 +122,17 @@ def fit_lobes_plain(
 ) -> Lobes:
     """The same in numpy, all texels side by side, in float64."""
     _, _, c = values.shape
-    good = (weight > 0) & np.isfinite(values).all(axis=2)
+    good = np.logical_and(weight > 0, np.isfinite(values).all(axis=2))
     y = np.where(good[..., None], values, 0).astype(float)
     weights = np.where(good, weight, 0).astype(float)
-    directions = _directions(light, place, near[0]), _directions(view, place, near[1])
+    lit, seen = _directions(light, place, near[0]), _directions(view, place, near[1])
     total, free = weights.sum(axis=1), np.flatnonzero(is_free)
     enough = (good.sum(axis=1) >= max(3, -(-len(free) // c))) & (total > 0)
     start = np.where(enough[:, None], _clamped(theta.astype(float)), theta)
     best, least = start.copy(), floor.astype(float)
 
     def looked(at: Floats, scale: Floats) -> tuple[Floats, ...]:
-        residual, slopes = _model(at, *directions, y)
+        residual, slopes = _model(at, lit, seen, y)
         square = np.square(residual).mean(axis=2)
         down = 1 / (1 + square / np.square(scale)[:, None])
         pull = (prior * np.square(at - start)).sum(axis=1) * np.square(scale / 3)
@@ -135,7 +140,8 @@ def fit_lobes_plain(
 
     def deviation(square: Floats) -> Floats:
         heavy = weights >= 0.5
-        use = np.where(heavy.any(axis=1)[:, None], heavy, good)
+        any_heavy: NDArray[np.bool_] = np.any(heavy, axis=1, keepdims=True)
+        use = np.where(any_heavy, heavy, good)
         ranked = np.sort(np.where(use, square, np.inf), axis=1)
         middle = np.minimum(use.sum(axis=1) // 2, square.shape[1] - 1)
         found = np.take_along_axis(ranked, middle[:, None], axis=1)[:, 0]
@@ -145,7 +151,7 @@ def fit_lobes_plain(
     now = looked(best, 3 * sigma)
     damping, running = np.full(len(best), 1e-2), enough.copy()
     for count in range(rounds):
-        a, g = _normal_equations(*now[:2], now[3])
+        a, g = _normal_equations(now[0], now[1], now[3])
         noise = np.square(sigma)[:, None]
         system = a[:, free][:, :, free]
         diagonal = np.einsum("tii->ti", system)
@@ -190,7 +196,7 @@ def better(one: Lobes, other: Lobes) -> Lobes:
 
 
 def shaded(lobes: Start | Lobes, light: Array, view: Array) -> Array:
-    """(t, m, c) values of t texels under m pairs (m, 3): what the tracer answers without shadows."""
+    """(t, m, c) values of t texels under m pairs (m, 3), as traced without shadows."""
     module = native.load("lobe")
     if module is None:
         return shaded_plain(lobes, light, view)
@@ -209,8 +215,8 @@ def shaded_plain(lobes: Start | Lobes, light: Array, view: Array) -> Array:
     """The same in numpy."""
     theta = _packed(Start(lobes.slope, lobes.roughness, lobes.albedo, lobes.specular))
     t, m, c = len(theta), len(light), lobes.albedo.shape[1]
-    rays = (np.broadcast_to(d, (t, m, 3)) for d in (light, view))
-    return _model(theta.astype(float), *rays, np.zeros((t, m, c)))[0].astype(np.float32)
+    lit, seen = (np.broadcast_to(d.astype(float), (t, m, 3)) for d in (light, view))
+    return _model(theta.astype(float), lit, seen, np.zeros((t, m, c)))[0].astype(np.float32)
 
 
 def _packed(start: Start) -> Array:
@@ -333,7 +339,7 @@ def _variance(
     """(t, 3) xx, xy, yy of the slopes; 0 where they are given."""
     if free[0] != 0:
         return np.zeros((len(noise), 3))
-    a, _ = _normal_equations(*now[:2], now[3])
+    a, _ = _normal_equations(now[0], now[1], now[3])
     system = a[:, free][:, :, free]
     diagonal = np.einsum("tii->ti", system)
     diagonal += np.square(noise)[:, None] * prior[free] + 1e-12 * total[:, None] + 1e-30
