@@ -156,7 +156,7 @@ def _rows(
         weight *= seen[:, rows].reshape(len(seen), -1).T
     place = stack.place(height, rows)
     with np.errstate(invalid="ignore"):
-        grey = np.einsum("tmc->tm", values) / np.float32(values.shape[2])
+        grey: Array = values @ np.full(values.shape[2], 1 / values.shape[2], np.float32)
     towards: Floats = stack.light
     if stack.light_near is not None:
         rays = stack.light_near[None] - place[:, None]

@@ -189,7 +189,8 @@ def curl(slope: Floats, *, wrap: bool) -> float:
     upper, left = p + np.roll(p, -1, 1), q + np.roll(q, -1, 0)
     around = (upper + np.roll(left, -1, 1) - np.roll(upper, -1, 0) - left) / 2
     inner = around if wrap else around[:-1, :-1]
-    return float(np.sqrt(np.nanmean(np.square(inner))))
+    known = inner[np.isfinite(inner)]
+    return float(np.sqrt(np.square(known).mean())) if known.size else 0.0
 
 
 def _weighted(system: System, height: Floats) -> tuple[tuple[Floats, Floats], ...]:

@@ -20,6 +20,7 @@ from btfkit.fitting.heightfield import orientation
 from btfkit.fitting.heightfield.bounds import shadow_bounds
 from btfkit.fitting.heightfield.fusion import Fused, fuse
 from btfkit.fitting.heightfield.parallax import Sweep, disagreement, fitted_heights, reached, sweep
+from btfkit.heldout import split
 from btfkit.relief.integration import integrate
 from btfkit.relief.photometric import Normals, check_lights, photometric_stereo
 from btfkit.relief.relief import Relief
@@ -38,6 +39,8 @@ _SLOPE_ERROR = 0.03
 # Height error at which confidence is a half, texels.
 _HALF_HEIGHT = 0.25
 _MOST_HELD = 12
+# Errors of heights by what views disagree: fitted to three traced materials, docs/heightfields.md.
+_LEAST_ERROR, _BY_DISAGREEMENT = 0.05, 5.0
 
 
 @final
@@ -98,7 +101,6 @@ def find_relief(
         solved = _with_parallax(btf, stack, budget_s, start, seed, progress)
     else:
         solved = _from_normals(stack)
-    w = stack.size[1]
     height = solved.heights[solved.best]
     lit, seen = (reached(height, d, wrap=stack.wrap) for d in (stack.lights, stack.views))
     sure = np.isfinite(solved.deviation)
@@ -153,8 +155,6 @@ class _Solved:
 
 
 def _split(count: int, holdout: float, seed: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    from btfkit.fitting.fit import split
-
     # Few pairs are all needed.
     if count < 16 or not holdout:
         return np.arange(count), np.arange(0)
@@ -208,7 +208,9 @@ def _with_parallax(
     orientation.check_views(many, first)
     height = start
     if height is None:
-        height = fitted_heights(_as_btf(btf, stack), budget_s=budget_s, seed=seed, progress=progress)
+        height = fitted_heights(
+            _as_btf(btf, stack), budget_s=budget_s, seed=seed, progress=progress
+        )
     before = disagreement(many, np.zeros_like(height))
     heights = {"model": height}
     found: tuple[Normals, Sweep, Fused] | None = None
@@ -227,9 +229,9 @@ def _with_parallax(
             f"{a} - {b}": float(np.sqrt(np.median(np.square(heights[a] - heights[b]))))
             for a, b in (("normals", "parallax"), ("normals", "fusion"), ("parallax", "fusion"))
         },
-        "expected_error_texels": float(np.median(fused.deviation)),
+        "expected_error_texels": float(np.median(_expected_error(fused, swept))),
     }
-    return _Solved(normals, heights, "fusion", fused.deviation, turn, figures)
+    return _Solved(normals, heights, "fusion", _expected_error(fused, swept), turn, figures)
 
 
 def _round(
@@ -245,6 +247,12 @@ def _round(
         wrap=few.wrap, bounds=shadow_bounds(few, height, normals), seed=seed,
     )  # fmt: skip
     return normals, swept, fused
+
+
+def _expected_error(fused: Fused, swept: Sweep) -> Array:
+    """(h, w) texels: noise, and what grows with the views' disagreement: hidden parts, seams."""
+    systematic = _LEAST_ERROR**2 + np.square(_BY_DISAGREEMENT * swept.disagreement)
+    return np.sqrt(np.square(fused.deviation) + systematic).astype(np.float32)
 
 
 def _weights(normals: Normals) -> Array:

@@ -41,7 +41,9 @@ def against_truth(found: Found, truth: Relief) -> dict[str, Any]:
         raise ValueError(f"the true relief has {truth.size} texels; found were {found.relief.size}")
     w = truth.size[1]
     normal, height = filtered(truth), truth.height * np.float32(w)
-    blurred = gaussian_filter(height, _FOOTPRINT, mode="wrap" if truth.wrap == "wrap" else "nearest")
+    blurred = gaussian_filter(
+        height, _FOOTPRINT, mode="wrap" if truth.wrap == "wrap" else "nearest"
+    )
     counted = (normal[..., 2] > np.cos(np.radians(_STEEPEST_DEG))) & (found.seen >= _HALF)
     half = (found.lit >= _HALF) & (found.seen >= _HALF)
     degrees = np.degrees(np.arccos(np.clip((found.normals.normal() * normal).sum(-1), -1, 1)))

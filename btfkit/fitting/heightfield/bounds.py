@@ -62,9 +62,7 @@ def shadow_bounds(stack: Stack, height: Array, normals: Normals) -> Bounds:
     )
 
 
-def _lit_share(
-    stack: Stack, height: Array, normals: Normals
-) -> tuple[Floats, NDArray[np.bool_]]:
+def _lit_share(stack: Stack, height: Array, normals: Normals) -> tuple[Floats, NDArray[np.bool_]]:
     """(k, h, w) of each light: its values in parts of the model's; whether it faces the surface."""
     h, w = stack.size
     seen = visibility(height, stack.views, wrap=stack.wrap)

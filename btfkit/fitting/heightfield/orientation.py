@@ -1,4 +1,4 @@
-"""Directions of the wrong hand, told by what they do: slopes that curl, views that disagree more."""
+"""Directions of the wrong hand: slopes that curl, views that disagree more."""
 
 from __future__ import annotations
 

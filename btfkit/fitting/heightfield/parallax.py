@@ -90,7 +90,7 @@ def heights_of(material: Material) -> Array:
 
 
 def reached(height: Array, towards: Array, *, wrap: bool) -> Array:
-    """(h, w) share of directions that reach the surface: where few rays end, heights are guesses."""
+    """(h, w) share of directions that reach the surface; heights that few reach are guesses."""
     return visibility(height, towards, wrap=wrap).mean(axis=0).astype(np.float32)
 
 

@@ -31,7 +31,7 @@ def write_json(figures: Mapping[str, Any], path: Path, *, force: bool = False) -
 def write_html(
     found: Found, btf: BTF, figures: Mapping[str, Any], path: Path, *, force: bool = False
 ) -> None:
-    """A page that holds its pictures: relief, sources, maps, and measured pairs beside re-rendered."""
+    """A page with its pictures: relief, sources, maps, measured pairs beside re-rendered."""
     parts = [
         ("Relief", pictures.preview(found.relief)),
         ("Sources", _sources(found)),
