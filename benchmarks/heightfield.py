@@ -52,8 +52,8 @@ def main() -> None:
         for size in map(int, given.sizes.split(",")):
             rows.append(measure(name, size, given.relief, given.budget))
             print(json.dumps(rows[-1], default=str), flush=True)
-    print("| material | size | range | CPU s | normals, degrees | " + " | ".join(
-        ("model", "normals", "parallax", "fusion")) + " | fusion, half | filtered, half |")  # fmt: skip
+    print("| material | size | range | CPU s | normals, degrees", end=" | ")
+    print("model | normals | parallax | fusion | fusion, half | filtered, half |")
     for row in rows:
         heights: dict[str, dict[str, float]] = row["heights"]  # type: ignore[assignment]
         cells = [f"{heights[k]['rms']:.3f}" if k in heights else "-"

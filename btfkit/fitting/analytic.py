@@ -150,7 +150,7 @@ def _rows(
     stack: Stack, height: Array, seen: NDArray[np.bool_] | None, given: Array | None, rows: slice
 ) -> tuple[Lobes, Array, Array]:
     values = stack.seen(stack.values, height, rows)
-    measured = np.isfinite(values).all(axis=2)
+    measured = np.logical_and.reduce(np.isfinite(values), axis=2)
     weight = measured.astype(np.float32)
     if seen is not None:
         weight *= seen[:, rows].reshape(len(seen), -1).T

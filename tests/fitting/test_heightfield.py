@@ -29,7 +29,7 @@ SIZE = 32
 
 @pytest.fixture(scope="module")
 def knit() -> tuple[Relief, BTF]:
-    relief = procedural.make("knit", SIZE, relief_texels=2.5)
+    relief = procedural.make("knit", SIZE, relief_texels=1.2)
     btf = synth.relief_btf(relief, lights="14", views="12", samples=2)
     return relief, replace(btf, textures=btf.batch(np.arange(len(btf))))
 

@@ -39,6 +39,8 @@ _SLOPE_ERROR = 0.03
 # Height error at which confidence is a half, texels.
 _HALF_HEIGHT = 0.25
 _MOST_HELD = 12
+# Standard deviation of heights of a flat sample, texels.
+_FLAT_HEIGHT = 0.1
 # Errors of heights by what views disagree: fitted to three traced materials, docs/heightfields.md.
 _LEAST_ERROR, _BY_DISAGREEMENT = 0.05, 5.0
 
@@ -171,9 +173,16 @@ def _no_parallax(btf: BTF, stack: Stack) -> str | None:
     if len(views.views) < 3 or len(views.pairs) <= len(views.lights):
         return "parallax and fusion: no light is shared by several views"
     moved = moving(btf)
-    if moved is not None and moved < FLAT_TEXELS:
+    if moved is not None and moved < FLAT_TEXELS and _is_flat(stack):
         return f"parallax and fusion: the structure moves by less than {FLAT_TEXELS} texels"
     return None
+
+
+def _is_flat(stack: Stack) -> bool:
+    """Whether slopes say so too: structure that repeats hides its own movement."""
+    normals = photometric_stereo(stack.for_normals())
+    height = integrate(normals.slope, _weights(normals), wrap=stack.wrap).height
+    return float(height.std()) < _FLAT_HEIGHT
 
 
 def _from_normals(stack: Stack) -> _Solved:
