@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,18 @@ def test_heights_in_texels_come_back_in_tile_widths(tmp_path: Path) -> None:
     np.testing.assert_allclose(file.read(tmp_path / "r.exr").height, relief.height, rtol=1e-6)
 
 
+def test_heights_in_millimetres_need_the_edge_of_a_texel(tmp_path: Path) -> None:
+    relief = procedural.make("knit", 32)
+    with pytest.raises(ValueError, match="heights in mm need texel_mm"):
+        file.write(relief, tmp_path / "r.exr", unit="mm")
+    known = replace(relief, texel_mm=0.25)
+    file.write(known, tmp_path / "r.exr", unit="mm")
+    pixels, channels, _ = images.read_exr("r.exr", (tmp_path / "r.exr").read_bytes())
+    # float32 product and quotient by 8
+    np.testing.assert_allclose(pixels[..., channels.index("Z")], relief.height * 8, rtol=1e-6)
+    np.testing.assert_allclose(file.read(tmp_path / "r.exr").height, relief.height, rtol=1e-6)
+
+
 def test_normals_in_the_file_are_those_of_the_heights(tmp_path: Path) -> None:
     relief = procedural.make("cobbles", 32)
     file.write(relief, tmp_path / "r.exr")
@@ -65,7 +78,7 @@ def test_normals_in_the_file_are_those_of_the_heights(tmp_path: Path) -> None:
     ("channels", "attributes", "message"),
     [
         (("Y",), {}, "no channel Z; it has Y"),
-        (("Z",), {"btfkit:unit": "furlong"}, "unit 'furlong'; expected tile or texel"),
+        (("Z",), {"btfkit:unit": "furlong"}, "unit 'furlong'; expected tile, texel, mm"),
         (("Z", "roughness"), {}, r"roughness ranges 0..0; expected 0.02..1"),
     ],
 )
