@@ -15,7 +15,7 @@ from btfkit.export import TARGETS
 @verb("export", example="btfkit export wool.neumip.safetensors --to cpp -o wool-cpp")
 @click.argument("model", type=click.Path(path_type=Path))
 @click.option("--to", "target", required=True, type=click.Choice(list(TARGETS)),
-              help="npz: arrays, a numpy reader; cpp: a C++17 header; glsl: GLSL ES 3.00.")  # fmt: skip
+              help="Arrays with a numpy reader, a C++17 header, GLSL ES 3.00.")  # fmt: skip
 @click.option("-o", "--out", required=True, type=click.Path(path_type=Path), help="Folder to make.")
 @force_option
 def export_verb(bar: Bar, *, model: Path, target: str, out: Path, force: bool) -> Outcome:

@@ -77,8 +77,10 @@ def lines(
         if k:
             matrix = _padded(layer.weight, 4 * len(before))
         own = f"{name}{k + 1}"
-        write = _literal_layer if wide is None else _wide_layer
-        some, before = write(own, layer, matrix, before, wide, cut)  # type: ignore[operator]
+        if wide is None:
+            some, before = _literal_layer(own, layer, matrix, before, rounded=cut)
+        else:
+            some, before = _wide_layer(own, layer, matrix, before, wide, rounded=cut)
         found += some
     n = layers[-1].weight.shape[0]
     return found, [f"{before[k // 4]}.{'xyzw'[k % 4]}" for k in range(n)]
@@ -98,7 +100,7 @@ def vec4(values: Any) -> str:
 
 
 def _literal_layer(
-    own: str, layer: Dense, matrix: Array, before: list[str], _: None, rounded: bool
+    own: str, layer: Dense, matrix: Array, before: list[str], *, rounded: bool
 ) -> tuple[list[str], list[str]]:
     bias, groups = _groups(layer.bias), matrix.shape[0] // 4
     names = [f"{own}_{o}" for o in range(groups)]
@@ -114,7 +116,7 @@ def _literal_layer(
     if layer.gain is not None and layer.centre is not None:
         found += _normal_lines(own, layer, names)
     for o, name in enumerate(names):
-        text = activated(layer, name, f"{before[o]} + " if layer.residual else "", rounded)
+        text = activated(layer, name, f"{before[o]} + " if layer.residual else "", rounded=rounded)
         found += [f"{name} = {text};"] * (text != name)
     return found, names
 
@@ -136,7 +138,7 @@ def _normal_lines(own: str, layer: Dense, names: list[str]) -> list[str]:
 
 
 def _wide_layer(
-    own: str, layer: Dense, matrix: Array, before: list[str], wide: Weights, rounded: bool
+    own: str, layer: Dense, matrix: Array, before: list[str], wide: Weights, *, rounded: bool
 ) -> tuple[list[str], list[str]]:
     """The same in loops: arrays of vec4, weights fetched."""
     groups, width = matrix.shape[0] // 4, matrix.shape[1] // 4
@@ -163,12 +165,12 @@ def _wide_layer(
     names = [f"{own}[{o}]" for o in range(groups)]
     if layer.gain is not None and layer.centre is not None:
         found += _normal_lines(own, layer, names)
-    text = activated(layer, f"{own}[o]", f"{x}[o] + " if layer.residual else "", rounded)
+    text = activated(layer, f"{own}[o]", f"{x}[o] + " if layer.residual else "", rounded=rounded)
     found += [f"for (int o = 0; o < {groups}; ++o) {own}[o] = {text};"] * (text != f"{own}[o]")
     return found, names
 
 
-def activated(layer: Dense, z: str, before: str, rounded: bool) -> str:
+def activated(layer: Dense, z: str, before: str, *, rounded: bool) -> str:
     """Text of what a layer makes of its sums."""
     value = z if layer.omega == 1 else f"{literal(layer.omega)} * {z}"
     value = {
