@@ -151,6 +151,21 @@ const view = (() => {
     ]);
   }
 
+  // Milliseconds of a frame of w x h pixels, waited for; the least of some.
+  function timed(w, h, frames = 5) {
+    const times = [];
+    for (let k = 0; k < frames; ++k) {
+      const start = performance.now();
+      Object.assign(canvas, {width: w, height: h});
+      gl.viewport(0, 0, w, h);
+      draw(0, w, h);
+      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+      times.push(performance.now() - start);
+    }
+    request();
+    return Math.min(...times);
+  }
+
   const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
   // Turns an end of a direction across the sphere: right and up, degrees.
   function turn(name, dx, dy) {
@@ -254,5 +269,5 @@ const view = (() => {
   }
   Object.assign(state, START);
   start();
-  return {state, read, under, paint, pixelShown};
+  return {state, read, under, paint, timed, pixelShown};
 })();
