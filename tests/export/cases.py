@@ -22,7 +22,8 @@ SPECS = {
     "neumip": (NeuMIP, NEUMIP, "wrap"),
     "neumip-clamped": (NeuMIP, NeuMIPSpec(GRID, levels=1, features=8, output="relu"), "clamp"),
     "neumip-paper": (NeuMIPPaper, NeuMIPSpec(GRID, levels=3, output="released"), "wrap"),
-    "neubtf": (NeuBTF, NeuBTFSpec((16, 24), parallax=True), "wrap"),
+    # Sines of less than 2.5 times their sums: at random these double rounding layer by layer.
+    "neubtf": (NeuBTF, NeuBTFSpec((16, 24), omega=1.25, parallax=True), "wrap"),
     "rainer20": (Rainer20, RainerSpec((8, 12), latents=32, whitened=True), "clamp"),
 }
 
@@ -40,9 +41,12 @@ def made(name: str, *, seed: int = 0) -> Material:
             spread = 0.1 if name == "neubtf" or part == "texture.heights" else 0.5
             value = rng.random(shape) if name == "lambert" else rng.normal(0, spread, shape)
         elif part.endswith("norm.weight"):
-            value = rng.uniform(0.2, 0.5, shape)
+            value = rng.uniform(0.1, 0.3, shape)
         else:
             value = rng.normal(0, 1 / np.sqrt(shape[-1]), shape) + 0.1 * part.endswith("bias")
+        if part == "renderer.out.bias":
+            # Else most answers would be cut to 0.
+            value += 1
         half = part.startswith("texture") and getattr(spec, "precision", "") == "float16"
         weights[part] = value.astype(np.float16 if half else np.float32)
     return kind(spec, weights, header)

@@ -69,6 +69,7 @@ def wanted(material: Material, queries: Asked) -> Any:
 
 def agree(rgb: np.ndarray, opacity: np.ndarray, response: Any) -> None:
     assert np.isfinite(rgb).all()
+    assert np.mean(response.reflectance > 0.01) > 0.1
     limit = TOLERANCE * np.maximum(1, np.abs(response.reflectance))
     assert (np.abs(rgb - response.reflectance) <= limit).all()
     np.testing.assert_allclose(opacity, response.opacity, atol=1e-6)
