@@ -20,6 +20,8 @@ VERBS: dict[str, tuple[str, str]] = {
     "eval": ("btfkit.cli.eval", "Errors of a model on a BTF or a query file."),
     "query": ("btfkit.cli.query", "Answer a query file with a model."),
     "render": ("btfkit.cli.render", "A picture of a material on a simple shape."),
+    "view": ("btfkit.cli.view", "A page that shows a model or a BTF in any browser."),
+    "export": ("btfkit.cli.export", "A model as files that other programs take."),
     "synth": ("btfkit.cli.synth", "Make a procedural material with known relief."),
     "bench": ("btfkit.cli.bench", "Time against error of all models on this machine."),
     "info": ("btfkit.cli.info", "What a file is; without a path: versions and kernels."),

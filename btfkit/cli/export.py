@@ -1,0 +1,30 @@
+"""`btfkit export`: a model -> a folder that another program takes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from btfkit.cli.bar import Bar
+from btfkit.cli.options import force_option
+from btfkit.cli.outcome import Outcome, verb
+from btfkit.export import TARGETS
+
+
+@verb("export", example="btfkit export wool.neumip.safetensors --to cpp -o wool-cpp")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.option("--to", "target", required=True, type=click.Choice(list(TARGETS)),
+              help="Arrays with a numpy reader, a C++17 header, GLSL ES 3.00.")  # fmt: skip
+@click.option("-o", "--out", required=True, type=click.Path(path_type=Path), help="Folder to make.")
+@force_option
+def export_verb(bar: Bar, *, model: Path, target: str, out: Path, force: bool) -> Outcome:
+    """Write MODEL for another program, with a preview, its papers and an example that runs."""
+    from btfkit.export.package import export
+    from btfkit.files import refuse_existing
+    from btfkit.materials.file import load
+
+    refuse_existing(out, force=force)
+    made = export(load(model), target, out, force=force)
+    listing = "\n".join(f"  {size:>10,}  {name}" for name, size in made["files"].items())
+    return Outcome(f"{out}: {made['bytes']:,} bytes\n{listing}", {"out": out, **made})

@@ -1,0 +1,46 @@
+"""`btfkit view`: a model or a BTF -> one page for any browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from btfkit.cli.bar import Bar
+from btfkit.cli.options import force_option, out_option, stem
+from btfkit.cli.outcome import Outcome, verb
+
+
+@verb("view", example="btfkit view wool.neumip.safetensors -o wool.html")
+@click.argument("source", metavar="MODEL_OR_BTF", type=click.Path(path_type=Path))
+@out_option("*.html; by default the source's name with .html, here")
+@click.option("--small", is_flag=True, help="Textures of a model in 8 bits: half the bytes.")
+@force_option
+def view_verb(bar: Bar, *, source: Path, out: Path | None, small: bool, force: bool) -> Outcome:
+    """One self-contained page: a model on shapes to turn and light, or a BTF pair by pair.
+
+    Nothing is loaded from a network; the page may be mailed, or opened from a disc.
+    """
+    from btfkit import sources
+    from btfkit.btf import BTF
+    from btfkit.errors import FormatError
+    from btfkit.files import refuse_existing, whole
+    from btfkit.materials.base import Material
+    from btfkit.view import model, store
+
+    final = out or Path(stem(source) + ".html")
+    if final.suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"{final}: a page is *.html")
+    refuse_existing(final, force=force)
+    found = sources.read(source)
+    title = stem(source)
+    if isinstance(found, Material):
+        kind, text = "model", model.page(found, title=title, small=small)
+    elif isinstance(found, BTF):
+        kind, text = "btf", store.page(found, title=title, progress=bar)
+    else:
+        raise FormatError(source, "has no page; expected a fitted model or a BTF")
+    with whole(final, force=force) as partial:
+        partial.write_text(text, encoding="utf-8")
+    size = final.stat().st_size
+    return Outcome(f"{final}: {size:,} bytes", {"out": final, "kind": kind, "bytes": size})

@@ -1,0 +1,10 @@
+"""Materials for other programs: their evaluation as files, each with an example that runs."""
+
+from __future__ import annotations
+
+# Target -> function (material, program, folder) that writes it.
+TARGETS: dict[str, str] = {
+    "npz": "btfkit.export.npz:write",
+    "cpp": "btfkit.export.cpp:write",
+    "glsl": "btfkit.export.glsl:write",
+}

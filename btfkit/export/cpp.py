@@ -1,0 +1,279 @@
+"""`cpp`: one C++17 header, a file of numbers, and a program that uses both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit.conventions import (
+    EPSILON,
+    LEAK,
+    LEVELS_UNIT,
+    LOOKS,
+    LOWEST_COSINE,
+    MOST_LOG,
+    STEEPEST,
+)
+from btfkit.export.arrays import narrowed
+from btfkit.export.numbers import literal
+from btfkit.export.sections import filled, sections
+from btfkit.materials.base import Material
+from btfkit.native.neural.plain import YUV_TO_RGB
+from btfkit.program import Dense, DepthNetwork, Heights, Program, Texture
+
+SPACE = "btfkit_material"
+# Inputs of `conventions.INPUTS` by the names of the header's variables.
+_INPUTS = {
+    **{f"{d}{axis}": f"{name}[{k}]"
+       for d, name in (("l", "light"), ("v", "view"), ("h", "half"))
+       for k, axis in enumerate("xyz")},
+    **{f"{d}{axis}_disc": f"{name}_disc[{k}]"
+       for d, name in (("l", "light"), ("v", "view"))
+       for k, axis in enumerate("xy")},
+    "cos_diff": "cos_diff",
+    "level": f"level / {LEVELS_UNIT}",
+    "curvature": "0.0f",
+}  # fmt: skip
+
+
+def write(material: Material, program: Program, folder: Path) -> None:
+    """`material.hpp`, `material.bin` and `example.cpp`."""
+    header, numbers = source(program, model=material.model, texel_mm=material.header.texel_mm)
+    (folder / "material.hpp").write_text(header)
+    (folder / "material.bin").write_bytes(numbers)
+    example = sections("material.hpp.txt")["example"]
+    (folder / "example.cpp").write_text(filled(example, space=SPACE))
+
+
+def source(program: Program, *, model: str, texel_mm: float | None = None) -> tuple[str, bytes]:
+    """The header's text and the bytes of its numbers."""
+    store = _Store()
+    body = [*_depth(program, store), *_features(program, store), *_answer(program, store)]
+    constants = store.constants(program)
+    h, w = program.grid
+    edge = texel_mm or 0.0
+    values = {
+        "model": model, "space": SPACE, "channels": len(program.channels),
+        "counts": f"{sum(a.size for a in store.singles + store.halves)} numbers",
+        "tile_mm": f"{w * edge!r}, {h * edge!r}",
+        "below": "" if program.full_sphere else "    if (light[2] <= 0) return out;\n",
+        "reduced": "float(u - std::floor(u)), float(v - std::floor(v))" if program.wrap
+        else "float(std::clamp(u, 0.0, 1.0)), float(std::clamp(v, 0.0, 1.0))",
+        "steepest": _number(STEEPEST), "lowest": _number(LOWEST_COSINE), "looks": LOOKS,
+        "epsilon": _number(EPSILON),
+        "scale": _number(program.depth.scale) if program.depth else "0.0f",
+    }  # fmt: skip
+    parts = sections("material.hpp.txt")
+    chosen = _chosen(program)
+    before = "".join(parts[name] for name in ("start", "evaluate_start", *chosen[0]))
+    after = "".join(parts[name] for name in ("evaluate_end", "sum", *chosen[1]))
+    lines = "".join(f"    {line}\n" for line in body)
+    return filled(before, **values) + lines + filled(after, **values) + constants + filled(
+        parts["end"], **values
+    ), store.bytes()
+
+
+class _Store:
+    """Arrays by their place in the file: float32 first, then those that halves hold exactly."""
+
+    def __init__(self) -> None:
+        self.singles: list[NDArray[np.float32]] = []
+        self.halves: list[NDArray[np.float16]] = []
+        self._levels: list[str] = []
+        self._named: list[tuple[str, Sequence[NDArray[np.floating]]]] = []
+
+    def single(self, *arrays: NDArray[np.floating]) -> int:
+        """Where arrays lie, one after the other, as float32."""
+        at = sum(array.size for array in self.singles)
+        self.singles += [np.ascontiguousarray(array, np.float32) for array in arrays]
+        return at
+
+    def levels(self, name: str, levels: Sequence[NDArray[np.floating]]) -> str:
+        """Name of the constant that says where levels of a texture lie."""
+        self._named.append((name, levels))
+        return name
+
+    def constants(self, program: Program) -> str:
+        """Text of all constants; every texture has its place from here on."""
+        wide = {id(level): narrowed(level) for _, levels in self._named for level in levels}
+        at: dict[int, int] = {}
+        for _, levels in self._named:
+            for level in levels:
+                kept = wide[id(level)]
+                if kept.dtype == np.float32 and id(level) not in at:
+                    at[id(level)] = self.single(kept)
+        start = sum(array.size for array in self.singles)
+        for _, levels in self._named:
+            for level in levels:
+                kept = wide[id(level)]
+                if kept.dtype == np.float16 and id(level) not in at:
+                    at[id(level)] = start + sum(array.size for array in self.halves)
+                    self.halves.append(np.ascontiguousarray(kept))
+        lines = [
+            f"static constexpr std::size_t kSingles = {start};",
+            f"static constexpr std::size_t kHalves = {sum(a.size for a in self.halves)};",
+            f"static constexpr std::uint64_t kSum = {fnv(self.bytes())}ull;",
+            f"static constexpr float kAspect = {_number(program.aspect)};",
+        ]
+        for name, levels in self._named:
+            places = [f"{{{at[id(x)]}, {x.shape[0]}, {x.shape[1]}}}" for x in levels]
+            brackets = "" if name == "kHeights" else "[]"
+            listed = places[0] if name == "kHeights" else "{" + ", ".join(places) + "}"
+            lines.append(f"static constexpr Level {name}{brackets} = {listed};")
+        if isinstance(program.depth, Heights):
+            heights = program.depth.heights
+            lines.append(f"static constexpr float kTop = {_number(heights.max())};")
+            lines.append(f"static constexpr float kBottom = {_number(heights.min())};")
+        return "".join(f"  {line}\n" for line in lines)
+
+    def bytes(self) -> bytes:
+        """The file, little-endian."""
+        found = [array.astype("<f4").tobytes() for array in self.singles]
+        return b"".join(found + [array.astype("<f2").tobytes() for array in self.halves])
+
+
+def fnv(data: bytes) -> int:
+    """FNV-1a of bytes, 64 bits."""
+    found = 14695981039346656037
+    for byte in data:
+        found = (found ^ byte) * 1099511628211 & 0xFFFFFFFFFFFFFFFF
+    return found
+
+
+def _number(value: Any) -> str:
+    return literal(value) + "f"
+
+
+def _chosen(program: Program) -> tuple[list[str], list[str]]:
+    """Sections before the generated lines, and after them, that the program needs."""
+    inputs = {*program.inputs}
+    depth = program.depth
+    if isinstance(depth, DepthNetwork):
+        inputs |= {*depth.inputs}
+    layers = [*program.layers, *(depth.layers if isinstance(depth, DepthNetwork) else ())]
+    kinds = {head.kind for head in program.heads}
+    half = program.frames > 0 or inputs & {"hx", "hy", "hz", "cos_diff"}
+    disc = any(name.endswith("_disc") for name in inputs)
+    marched = isinstance(depth, Heights)
+    before = ["level" if program.leveled else "no_level"]
+    before += ["half"] * bool(half) + ["disc"] * disc + ["march_depth"] * marched
+    before += ["steps"] * (depth is not None)
+    after = ["beside_wrap" if program.wrap else "beside_clamp", "pyramid"]
+    after += ["dense"] * bool(layers) + ["normal"] * any(x.gain is not None for x in layers)
+    after += ["rounded"] * program.rounded + ["sigmoid"] * bool(kinds & {"mask", "opacity"})
+    after += ["on_disc"] * disc + ["step"] * (depth is not None) + ["crossing"] * marched
+    return before, after
+
+
+def _depth(program: Program, store: _Store) -> list[str]:
+    found = program.depth
+    if isinstance(found, Heights):
+        store.levels("kHeights", (found.heights,))
+    if not isinstance(found, DepthNetwork):
+        return []
+    place = store.levels("kDepth", (found.texture.levels[0],))
+    k = found.texture.levels[0].shape[-1]
+    names = {name: f"psi[{i}]" for i, name in enumerate(found.texture.features)}
+    lines = [f"float psi[{k}] = {{}};", f"lookup<{k}>({place}[0], uv[0], uv[1], 1, psi);"]
+    lines += _gathered("d0", found.inputs, {**_INPUTS, **names})
+    lines += _layers("d", found.layers, store, rounded=program.rounded)
+    return [*lines, f"const float depth = d{len(found.layers)}[0] * {_number(found.scale)};"]
+
+
+def _features(program: Program, store: _Store) -> list[str]:
+    lines: list[str] = []
+    every = [*program.textures, *([program.scaling] if program.scaling else [])]
+    for t, texture in enumerate(every):
+        place = store.levels(f"kTexture{t}", texture.levels)
+        k, count = texture.levels[0].shape[-1], len(texture.levels)
+        u, v = _moved(program, texture)
+        shifted = f"level - {_number(texture.shift)}"
+        lines.append(f"float t{t}[{k}];")
+        lines.append(f"pyramid<{k}>({place}, {count}, {shifted}, {u}, {v}, t{t});")
+    return lines
+
+
+def _moved(program: Program, texture: Texture) -> tuple[str, str]:
+    if program.depth is None or not (texture.view or texture.light):
+        return "uv[0]", "uv[1]"
+    view, light = _number(texture.view), _number(texture.light)
+    return tuple(  # type: ignore[return-value]
+        f"uv[{k}] + depth * ({view} * toward[{k}] - {light} * away[{k}])" for k in range(2)
+    )
+
+
+def _answer(program: Program, store: _Store) -> list[str]:
+    known = dict(_INPUTS)
+    for t, texture in enumerate(program.textures):
+        known |= {name: f"t{t}[{k}]" for k, name in enumerate(texture.features)}
+    for f in range(program.frames):
+        for name, vector in (("half", "half"), ("light", "light")):
+            products = [f"t0[{3 * f + k}] * {vector}[{k}]" for k in range(3)]
+            known[f"frame.{f}.{name}"] = " + ".join(products)
+    lines = _gathered("x0", program.inputs, known)
+    lines += _layers("x", program.layers, store, rounded=program.rounded)
+    last, at, heads = f"x{len(program.layers)}", 0, {}
+    for head in program.heads:
+        heads[head.kind] = at
+        at += head.count
+    lines += _output(program, last, heads)  # type: ignore[arg-type]
+    if "opacity" in heads:
+        lines.append(f"out.opacity = sigmoid({last}[{heads['opacity']}]);")
+        lines.append("if (!(out.opacity > 0)) for (float& value : out.rgb) value = 0;")
+    return lines
+
+
+def _output(program: Program, last: str, heads: dict[str, int]) -> list[str]:
+    loop, most = "for (int c = 0; c < kChannels; ++c)", _number(MOST_LOG)
+    if program.output == "cosine":
+        return [f"{loop} out.rgb[c] = {last}[{heads['linear']} + c] * light[2];"]
+    masked = f"(0.1f + sigmoid({last}[{heads['mask']} + c]))" if "mask" in heads else ""
+    if program.output == "released":
+        rows = ", ".join("{" + ", ".join(map(_number, row)) + "}" for row in YUV_TO_RGB)
+        first = heads["log"]
+        return [
+            f"static constexpr float kRgb[3][3] = {{{rows}}};",
+            f"{loop} {{",
+            "  float y = 0;",
+            "  for (int k = 0; k < 3; ++k)",
+            f"    y += kRgb[c][k] * std::min({last}[{first} + k], {most});",
+            f"  out.rgb[c] = std::max(std::expm1(std::min(y, {most})) * {masked}, 0.0f);",
+            "}",
+        ]
+    lines = [f"{loop} {{", f"  float y = {last}[{heads['log']} + c];"]
+    if program.scaling:
+        t = len(program.textures)
+        lines.append(f"  y = t{t}[c] + t{t}[kChannels + c] * y;")
+    lines += [f"  y *= {masked};"] * bool(masked)
+    return [*lines, f"  out.rgb[c] = std::expm1(std::clamp(y, 0.0f, {most}));", "}"]
+
+
+def _gathered(name: str, inputs: Sequence[str], known: dict[str, str]) -> list[str]:
+    return [f"float {name}[{len(inputs)}] = {{{', '.join(known[i] for i in inputs)}}};"]
+
+
+def _layers(name: str, layers: Sequence[Dense], store: _Store, *, rounded: bool) -> list[str]:
+    """Lines that take NAME0 to NAMEn through n layers."""
+    lines: list[str] = []
+    for k, layer in enumerate(layers):
+        n, m = layer.weight.shape
+        x, y = f"{name}{k}", f"{name}{k + 1}"
+        weight = layer.weight.T
+        at = store.single(weight, layer.bias)
+        lines += [f"float {y}[{n}];", f"dense<{m}, {n}>({at}, {x}, {y});"]
+        if layer.gain is not None and layer.centre is not None:
+            lines.append(f"normalise<{n}>({store.single(layer.gain, layer.centre)}, {y});")
+        value = f"{y}[k]" if layer.omega == 1 else f"{_number(layer.omega)} * {y}[k]"
+        value = {
+            "linear": value, "relu": f"std::max({value}, 0.0f)", "sine": f"std::sin({value})",
+            "leaky": f"({value}) * (({value}) > 0 ? 1.0f : {_number(LEAK)})",
+        }[layer.activation]  # fmt: skip
+        value = f"rounded({value})" if rounded and k + 1 < len(layers) else value
+        value = f"{x}[k] + {value}" if layer.residual else value
+        if value != f"{y}[k]":
+            lines.append(f"for (int k = 0; k < {n}; ++k) {y}[k] = {value};")
+    return lines

@@ -1,0 +1,76 @@
+"""What every export is: a folder with the material, its papers, a picture and an example."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from btfkit import jsonvalues
+from btfkit.btf import COLOUR
+from btfkit.export import TARGETS
+from btfkit.export.arrays import refuse_unknown
+from btfkit.files import whole_folder
+from btfkit.materials.base import Material
+from btfkit.program import Program
+from btfkit.render import studio
+
+PREVIEW = "preview.png"
+
+
+def export(
+    material: Material, target: str, out: str | os.PathLike[str], *, force: bool = False
+) -> dict[str, Any]:
+    """Write a material for another program.
+
+    Args:
+        material: one that has a program.
+        target: one of `TARGETS`.
+        out: the folder, which appears whole or not at all.
+        force: whether an existing one is replaced.
+
+    Returns:
+        What `about.json` in it says, and `files`: bytes by name.
+
+    Raises:
+        ValueError: no such target.
+        TypeError: the material has no program, or one that no export has.
+        FileExistsError: `out` exists and `force` is False.
+    """
+    if target not in TARGETS:
+        raise ValueError(f"no target {target!r}; there are {', '.join(TARGETS)}")
+    program = material.program()
+    refuse_unknown(program)
+    module, function = TARGETS[target].split(":")
+    write: Callable[[Material, Program, Path], None]
+    write = getattr(importlib.import_module(module), function)
+    said = {"target": target, **about(material)}
+    with whole_folder(out, force=force) as folder:
+        write(material, program, folder)
+        (folder / "about.json").write_text(json.dumps(jsonvalues.plain(said), indent=1) + "\n")
+        (folder / PREVIEW).write_bytes(studio.picture(material))
+        files = {path.name: path.stat().st_size for path in sorted(folder.iterdir())}
+    return {**said, "files": files, "bytes": sum(files.values())}
+
+
+def about(material: Material) -> dict[str, Any]:
+    """What a material says of itself outside this toolkit: size, licence, colour, meaning."""
+    header = material.header
+    h, w = header.grid
+    size_mm = None if header.texel_mm is None else [w * header.texel_mm, h * header.texel_mm]
+    return {
+        "model": material.model,
+        "quantity": header.quantity,
+        "channels": list(header.channels),
+        "colour": COLOUR if len(header.channels) == 3 else None,
+        "tile_mm": size_mm,
+        "texels": [w, h],
+        "wrap": header.wrap,
+        "licence": header.licence,
+        "provenance": dict(header.provenance),
+        "frame": "x right, y up, z out; light and view point away; u right, v down, in tiles",
+        "footprint": "standard deviation of the kernel, texels; 0.5 is one texel",
+    }

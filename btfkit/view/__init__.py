@@ -1,0 +1,1 @@
+"""Pages that show a material or a BTF, whole in one file."""

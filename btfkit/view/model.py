@@ -1,0 +1,77 @@
+"""A material as a page: its program as a shader, its textures within, nothing from elsewhere."""
+
+from __future__ import annotations
+
+from btfkit.export.arrays import refuse_unknown
+from btfkit.export.glsl import drawable, encoded
+from btfkit.export.numbers import literal
+from btfkit.export.package import about
+from btfkit.export.sections import filled, whole_text
+from btfkit.materials.base import Material
+from btfkit.render.picture import to_rgb
+from btfkit.view.page import composed, in_script, section
+
+
+def page(material: Material, *, title: str, small: bool = False) -> str:
+    """One HTML page, which draws a material on simple shapes by WebGL2.
+
+    Args:
+        material: one that has a program.
+        title: shown, and escaped.
+        small: textures as bytes between the ends of each channel instead of half floats.
+
+    Raises:
+        TypeError: the material has no program.
+        ValueError: textures that a browser cannot hold.
+    """
+    program = material.program()
+    refuse_unknown(program)
+    made = drawable(program, model=material.model, texels="byte" if small else "half")
+    c = len(program.channels)
+    scene = filled(section("scene.glsl.txt", "scene"), channels=c, rgb=_rgb(program.channels))
+    h, w = program.grid
+    carried = {
+        "aspect": program.aspect,
+        "grid": [w, h],
+        "leveled": program.leveled,
+        "about": _said(material),
+        "textures": made.about,
+        "data": {name: encoded(data) for name, data in made.data.items()},
+        "fragment": "#version 300 es\nprecision highp float;\nprecision highp int;\n"
+        + made.source + scene,
+    }  # fmt: skip
+    return composed(
+        "model", "model.js", title=title,
+        upload=whole_text("upload.js"), material=in_script(carried),
+    )  # fmt: skip
+
+
+def _said(material: Material) -> list[tuple[str, str]]:
+    """Rows of names and values that the page shows about a material."""
+    known = about(material)
+    tile = known["tile_mm"]
+    w, h = known["texels"]
+    channels = ", ".join(known["channels"])
+    return [
+        ("model", known["model"]),
+        ("texels", f"{w} x {h}"),
+        ("tile", "size unknown" if tile is None else f"{tile[0]:.4g} x {tile[1]:.4g} mm"),
+        ("channels", channels if len(channels) <= 40 else f"{len(known['channels'])}"),
+        ("borders", "tile" if known["wrap"] == "wrap" else "do not tile"),
+        ("licence", known["licence"] or "not stated"),
+    ]
+
+
+def _rgb(channels: tuple[str, ...]) -> str:
+    """A vec3 of the channels' linear RGB; of channels without colour their mean."""
+    try:
+        matrix = to_rgb(channels)
+    except ValueError:
+        return f"vec3(({' + '.join(f'value[{k}]' for k in range(len(channels)))}) / " + (
+            f"{literal(len(channels))})"
+        )
+    rows = [
+        " + ".join(f"{literal(m)} * value[{k}]" for k, m in enumerate(column) if m)
+        for column in matrix.T
+    ]
+    return f"vec3({', '.join(row or '0.0' for row in rows)})"

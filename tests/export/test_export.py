@@ -1,0 +1,242 @@
+"""Exports answer as the material does: each is run, by its own example."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import warnings
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from cases import SPECS, directions, made
+
+from btfkit.cli import btfkit
+from btfkit.cli.outcome import run
+from btfkit.export import TARGETS
+from btfkit.export.arrays import named, narrowed
+from btfkit.export.glsl.atlas import atlas, quantised
+from btfkit.export.package import export
+from btfkit.export.sections import filled
+from btfkit.materials.base import Header, Material
+from btfkit.materials.file import save
+from btfkit.materials.lambert import Lambert, LambertSpec
+from btfkit.materials.measured.interpolation import Interpolation
+from btfkit.program import Dense, Head, Heights, Program, Texture
+from btfkit.relief.synth import synth_btf
+
+COMPILER = shutil.which("g++") or shutil.which("c++")
+every_case = pytest.mark.parametrize("name", list(SPECS))
+# float32 through the layers in another order; of large values the same share.
+TOLERANCE = 1e-5
+
+
+class Asked(NamedTuple):
+    """Queries (b, ...), most of them easy, some on every edge."""
+
+    uv: np.ndarray
+    light: np.ndarray
+    view: np.ndarray
+    footprint: np.ndarray
+
+
+@cache
+def asked(count: int = 1500) -> Asked:
+    rng = np.random.default_rng(1)
+    uv = rng.uniform(-2, 3, (count, 2)).astype(np.float32)
+    uv[:40] *= 1e6
+    light, view = directions(rng, count), directions(rng, count)
+    view[40:60, 2] = rng.uniform(0, 1e-6, 20)
+    light[60:80, 2] = rng.uniform(-1, 0, 20)
+    light[80:90] = -view[80:90]
+    view[90:100, 2] = -0.5
+    light[100:110] *= 1e4
+    footprint = rng.choice([0, 0.5, 1.3, 7, 1e30, np.inf], count).astype(np.float32)
+    uv[110:115, 0], view[115:120, 1], light[120:125] = np.nan, np.inf, 0
+    return Asked(uv, light, view, footprint)
+
+
+def wanted(material: Material, queries: Asked) -> Any:
+    with warnings.catch_warnings():
+        # Counts of what is masked, and of footprints that a model does not know.
+        warnings.simplefilter("ignore", UserWarning)
+        return material.evaluate(*queries)
+
+
+def agree(rgb: np.ndarray, opacity: np.ndarray, response: Any) -> None:
+    assert np.isfinite(rgb).all()
+    assert np.mean(response.reflectance > 0.01) > 0.1
+    limit = TOLERANCE * np.maximum(1, np.abs(response.reflectance))
+    assert (np.abs(rgb - response.reflectance) <= limit).all()
+    np.testing.assert_allclose(opacity, response.opacity, atol=1e-6)
+
+
+@every_case
+def test_arrays_and_their_reader_in_numpy_answer_as_the_material(name: str, tmp_path: Path) -> None:
+    material, queries = made(name), asked()
+    export(material, "npz", tmp_path / "out")
+    np.savez(tmp_path / "q.npz", **queries._asdict())
+    command = [sys.executable, tmp_path / "out" / "evaluate.py", tmp_path / "q.npz"]
+    subprocess.run([*command, tmp_path / "a.npz"], check=True)
+    with np.load(tmp_path / "a.npz") as answers:
+        agree(answers["rgb"], answers["opacity"], wanted(material, queries))
+
+
+@every_case
+@pytest.mark.slow
+@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler: apt-get install g++")
+def test_the_header_compiles_without_a_warning_and_answers_as_the_material(
+    name: str, tmp_path: Path
+) -> None:
+    material, queries = made(name), asked()
+    out = tmp_path / "out"
+    export(material, "cpp", out)
+    flags = ["-O1", "-std=c++17", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run([COMPILER, *flags, "example.cpp", "-o", "example"], cwd=out, check=True)
+    np.column_stack(queries).astype("<f4").tofile(out / "q.bin")
+    subprocess.run(["./example", "q.bin", "a.bin"], cwd=out, check=True)
+    answers = np.fromfile(out / "a.bin", "<f4").reshape(len(queries.uv), -1)
+    agree(answers[:, :-1], answers[:, -1], wanted(material, queries))
+    said = subprocess.run(["./example"], cwd=out, check=True, capture_output=True, text=True)
+    assert "ns an answer" in said.stdout
+    (out / "material.bin").write_bytes((out / "material.bin").read_bytes()[:-1] + b"?")
+    spoilt = subprocess.run(["./example"], cwd=out, check=False, capture_output=True, text=True)
+    assert spoilt.returncode == 1
+    assert "not the numbers that this header was written with" in spoilt.stderr
+
+
+@pytest.mark.parametrize("value", [1e4, 6e4])
+def test_bright_answers_keep_their_share(value: float, tmp_path: Path) -> None:
+    """A texture of logarithms, whose answers are 1e4 and more."""
+    logs = np.full((4, 4, 3), np.log1p(value), np.float32)
+    texture = Texture("logs", (logs,))
+    layer = Dense(np.eye(3, dtype=np.float32), np.zeros(3, np.float32), "linear")
+    program = Program(
+        ("R", "G", "B"), (4, 4), 1.0, True, (texture,), texture.features, (layer,),
+        (Head("log", 3),), "log",
+    )  # fmt: skip
+    from btfkit.export import npz
+
+    folder = tmp_path / "out"
+    folder.mkdir()
+    npz.write(made("lambert"), program, folder)
+    queries = asked(200)
+    np.savez(tmp_path / "q.npz", **queries._asdict())
+    command = [sys.executable, folder / "evaluate.py", tmp_path / "q.npz", tmp_path / "a.npz"]
+    subprocess.run(command, check=True)
+    with np.load(tmp_path / "a.npz") as answers:
+        lit = answers["rgb"][:, 0] > 0
+        assert lit.sum() > 50
+        np.testing.assert_allclose(answers["rgb"][lit], value, rtol=TOLERANCE)
+
+
+def test_a_reader_has_the_parts_that_its_material_needs(tmp_path: Path) -> None:
+    sizes, readers = {}, {}
+    for name in ("lambert", "neumip"):
+        export(made(name), "npz", tmp_path / name)
+        readers[name] = (tmp_path / name / "evaluate.py").read_text()
+        export(made(name), "cpp", tmp_path / f"{name}-cpp")
+        sizes[name] = (tmp_path / f"{name}-cpp" / "material.hpp").read_text()
+    for part in ("crossing", "half", "frame"):
+        assert part in readers["neumip"]
+        assert part not in readers["lambert"].replace("half =", "").replace("half.T", "")
+    assert "crossing" in sizes["neumip"]
+    assert not any(part in sizes["lambert"] for part in ("crossing", "dense", "sigmoid", "disc"))
+
+
+@pytest.mark.parametrize("target", list(TARGETS))
+def test_papers_and_a_picture_travel_along(target: str, tmp_path: Path) -> None:
+    result = export(made("lambert"), target, tmp_path / "out")
+    about = json.loads((tmp_path / "out" / "about.json").read_text())
+    assert about["licence"] == "CC0-1.0"
+    assert about["tile_mm"] == [9.0, 6.0]
+    assert about["colour"] == "linear BT.709, D65"
+    assert (tmp_path / "out" / "preview.png").read_bytes().startswith(b"\x89PNG")
+    files = {path.name: path.stat().st_size for path in (tmp_path / "out").iterdir()}
+    assert result["files"] == dict(sorted(files.items()))
+    assert result["bytes"] == sum(files.values())
+
+
+def test_numbers_are_halves_where_halves_hold_them(tmp_path: Path) -> None:
+    exact, thirds = np.float32([1, 0.5, 2.25]), np.float32([1 / 3])
+    assert narrowed(exact).dtype == np.float16
+    assert narrowed(thirds).dtype == np.float32
+    assert narrowed(np.float32([1e6])).dtype == np.float32
+    _, arrays = named(made("neumip").program())
+    assert arrays["textures.0.levels.0"].dtype == np.float16
+    assert arrays["layers.0.weight"].dtype == np.float32
+
+
+@every_case
+def test_an_atlas_holds_every_level_once_and_nothing_overlaps(name: str) -> None:
+    program = made(name).program()
+    textures = atlas(program, "half")
+    taken = np.zeros(textures.size, int)
+    for place, groups in textures.order:
+        taken[place.layer : place.layer + groups, place.y : place.y + place.h,
+              place.x : place.x + place.w] += 1  # fmt: skip
+        assert place.y + place.h <= textures.size[1]
+        assert place.x + place.w <= textures.size[2]
+    assert taken.max() == 1
+    assert textures.data.size == 4 * taken.sum()
+
+
+@pytest.mark.parametrize(("texels", "step"), [("half", 2.0**-11), ("byte", 0.5 / 255)])
+def test_a_quantised_program_is_off_by_half_a_step(texels: Any, step: float) -> None:
+    program = made("rainer20").program()
+    near = quantised(program, texels)
+    for texture, stored in zip(program.textures, near.textures, strict=True):
+        values = texture.levels[0]
+        # Of a half float its own size, of a byte the range of its channel.
+        reach = np.abs(values) if texels == "half" else np.ptp(values, axis=(0, 1))
+        assert (np.abs(stored.levels[0] - values) <= step * reach + 1e-6).all()
+
+
+def test_what_no_export_knows_is_refused_by_name(tmp_path: Path) -> None:
+    material = made("lambert")
+    with pytest.raises(ValueError, match="no target 'pdf'; there are npz, cpp, glsl"):
+        export(material, "pdf", tmp_path / "out")
+    btf = synth_btf("knit", size=8, lights="3", views="3", samples=1)
+    with pytest.raises(TypeError, match="interpolation blends measured pairs"):
+        export(Interpolation.of(btf), "npz", tmp_path / "out")
+    from dataclasses import replace
+
+    from btfkit.export.arrays import refuse_unknown
+
+    curved = Heights(np.zeros((2, 2), np.float32), 0.1, curved=True)
+    with pytest.raises(TypeError, match="bends with curvature"):
+        refuse_unknown(replace(material.program(), depth=curved))
+    large = Lambert(
+        LambertSpec((1, 8200)), {"texture": np.ones((1, 8200, 3), np.float32)}, Header((1, 8200))
+    )
+    with pytest.raises(ValueError, match=r"8200 x 1 texels .* fit a smaller texture"):
+        export(large, "glsl", tmp_path / "out")
+    bright = Lambert(
+        LambertSpec((1, 2)), {"texture": np.full((1, 2, 3), 7e4, np.float32)}, Header((1, 2))
+    )
+    with pytest.raises(ValueError, match="holds numbers above 65504"):
+        export(bright, "glsl", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(ValueError, match="no value for @there@"):
+        filled("@there@")
+
+
+def test_the_verb_writes_a_folder_and_replaces_none_unasked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, out = tmp_path / "flat.lambert.safetensors", tmp_path / "flat"
+    save(made("lambert"), model)
+    call = ["export", str(model), "--to", "npz", "-o", str(out)]
+    assert run(btfkit, [*call, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert said["bytes"] == sum(path.stat().st_size for path in out.iterdir())
+    (out / "mine").touch()
+    assert run(btfkit, call) == 1
+    assert "exists; --force" in capsys.readouterr().err
+    assert (out / "mine").exists()
+    assert run(btfkit, [*call, "--force"]) == 0
+    assert not (out / "mine").exists()

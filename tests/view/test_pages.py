@@ -1,0 +1,289 @@
+"""Pages in Chromium: pixels against the material, pictures against the renderer, hands on it."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+import warnings
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import browser
+import cv2
+import numpy as np
+import pytest
+from cases import GRID, made
+
+from btfkit.directions import from_angles
+from btfkit.export.glsl.atlas import quantised
+from btfkit.fitting.fit import fit
+from btfkit.materials.base import Header, Material
+from btfkit.materials.lambert import Lambert, LambertSpec
+from btfkit.native.neural import plain
+from btfkit.relief.synth import synth_btf
+from btfkit.render.preview import Scene, render
+from btfkit.shapes.catalogue import shape_of
+from btfkit.view import model, store
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+W, H = 96, 80
+SHAPES = ("plane", "sphere", "cylinder", "torus")
+ANSWER = "<pre id='out'></pre><script>document.getElementById('out').textContent = JSON.stringify((() => {{ {} }})());</script></body>"
+ENCODE = """const coded = (found) => { let text = ""; for (const byte of new Uint8Array(found.buffer)) text += String.fromCharCode(byte); return btoa(text); };"""
+
+
+def probed(text: str, script: str, folder: Path) -> Any:
+    """What a function body gives, run at the end of a page that says nothing on its console."""
+    page = folder / "page.html"
+    page.write_text(text.replace("</body>", ANSWER.format(script)))
+    seen = browser.load(page)
+    assert seen.errors == []
+    return json.loads(html.unescape(seen.text("out")))
+
+
+def passes(text: str, states: list[dict[str, Any]], folder: Path) -> list[np.ndarray]:
+    """(4, H, W, 4) numbers of each state of a page, rows from above."""
+    script = f"""{ENCODE}
+      return {json.dumps(states)}.map((state) => {{
+        Object.assign(view.state, state);
+        return [1, 2, 3, 4].map((show) => coded(view.read(show, {W}, {H})));
+      }});"""
+    found = probed(text, script, folder)
+    return [
+        np.stack([np.frombuffer(base64.b64decode(x), "<f4").reshape(H, W, 4)[::-1] for x in four])
+        for four in found
+    ]
+
+
+def states(**more: Any) -> list[dict[str, Any]]:
+    return [
+        {"shape": shape, "repeat": 3, "eye": [35, 250], "light": [50, 60], **more}
+        for shape in SHAPES
+    ]
+
+
+def answered(program: Any, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What a program says to the queries of a page's pixels, and (k, 3) what the page says."""
+    where, light, view, rgb = numbers.reshape(4, -1, 4)
+    lit = (where[:, 3] > 0) & (light[:, 3] == 0)
+    up = light[lit, 2] > 0
+    uv, ways, eyes = where[lit, :2], light[lit, :3], view[lit, :3]
+    wanted, _ = plain.answer(
+        program, uv, ways / np.linalg.norm(ways, axis=1, keepdims=True), eyes, where[lit, 2]
+    )
+    return np.where(up[:, None], wanted, 0), rgb[lit, :3]
+
+
+@cache
+def fitted() -> Material:
+    btf = synth_btf("knit", size=16, lights="9", views="7", samples=4)
+    settings = {"batch": "1024", "levels": "3"}
+    return fit(btf, model="neumip", steps=300, settings=settings, device="cpu").material
+
+
+@pytest.mark.parametrize("name", ["neumip", "neubtf"])
+def test_pixels_are_what_the_program_says_to_their_queries(name: str, tmp_path: Path) -> None:
+    material = made(name)
+    near = quantised(material.program(), "half")
+    some = states() if name == "neumip" else states()[1:2]
+    for numbers in passes(model.page(material, title="x"), some, tmp_path):
+        wanted, found = answered(near, numbers)
+        error = np.abs(found - wanted) / np.maximum(1, np.abs(wanted))
+        assert len(found) > 1500
+        assert np.mean(error > 2e-4) <= 1e-3
+
+
+@pytest.mark.parametrize(("small", "limit"), [(False, 2e-4), (True, 5e-3)])
+def test_pixels_of_a_fitted_material_are_its_answers(
+    small: bool, limit: float, tmp_path: Path
+) -> None:
+    material = fitted()
+    program = material.program() if small else quantised(material.program(), "half")
+    for numbers in passes(model.page(material, title="x", small=small), states(), tmp_path):
+        wanted, found = answered(program, numbers)
+        assert np.mean(np.abs(found - wanted) > limit) <= 1e-3
+
+
+def test_a_page_shows_what_the_renderer_draws(tmp_path: Path) -> None:
+    material = made("neumip")
+    text = model.page(material, title="x")
+    for shape, numbers in zip(SHAPES, passes(text, states(), tmp_path), strict=True):
+        form = shape_of(shape, repeat=3, aspect=material.header.aspect, picture=1.0)
+        eye = from_angles(*np.radians([35.0, 250.0]))
+        lamp = from_angles(*np.radians([50.0, 60.0]))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            drawn = render(Scene(material, form, lamp[None]), view=eye, size=(H, W))
+        assert np.mean((numbers[0, ..., 3] > 0) != (drawn.cover > 0.5)) < 0.005
+        both = (numbers[0, ..., 3] > 0) & (drawn.cover > 0.5)
+        error = np.abs(numbers[3, ..., :3] - drawn.radiance)[both].max(axis=1)
+        # Rays in float32 and in float64 part at silhouettes, shadows and edges of the march.
+        assert np.median(error) < 1e-3
+        assert np.mean(error > 0.02) < 0.02
+
+
+def test_detail_follows_the_size_of_pixels_on_the_surface(tmp_path: Path) -> None:
+    text = model.page(fitted(), title="x")
+    near, far, off = passes(
+        text,
+        [
+            {"shape": "plane", "eye": [0, 0], "repeat": 1, "zoom": zoom, "detail": detail}
+            for zoom, detail in ((1, 1), (0.5, 1), (0.5, 0))
+        ],
+        tmp_path,
+    )
+    middle = (0, H // 2, W // 2, 2)
+    # Half a step between pixels; the tile of 16 texels is as wide as the picture is high.
+    assert near[middle] == pytest.approx(16 / H / 2, rel=1e-4)
+    assert far[middle] == pytest.approx(16 / H, rel=1e-4)
+    assert off[middle] == 0.5
+
+
+def test_hands_turn_light_zoom_and_read_it(tmp_path: Path) -> None:
+    found = probed(model.page(made("lambert"), title="x"), """
+      const canvas = document.getElementById("picture"), box = canvas.getBoundingClientRect();
+      const state = () => JSON.parse(JSON.stringify(view.state)), log = {start: state()};
+      const key = (key, shiftKey = false) => canvas.dispatchEvent(new KeyboardEvent("keydown", {key, shiftKey}));
+      const pointer = (type, id, x, y, more = {}) => canvas.dispatchEvent(new PointerEvent(type, {pointerId: id, clientX: x, clientY: y, ...more}));
+      key("ArrowRight"); log.eye = state();
+      key("ArrowUp", true); log.light = state();
+      key("3"); key("]"); key("."); key("d"); log.keys = state();
+      key("r"); log.reset = state();
+      pointer("pointerdown", 1, 100, 100); pointer("pointermove", 1, 140, 100); pointer("pointerup", 1, 140, 100); log.dragged = state();
+      key("r"); pointer("pointerdown", 1, 100, 100, {shiftKey: true}); pointer("pointermove", 1, 140, 100, {shiftKey: true}); pointer("pointerup", 1, 140, 100); log.lit = state();
+      key("r"); canvas.dispatchEvent(new WheelEvent("wheel", {deltaY: -100, cancelable: true})); log.wheel = state();
+      key("r"); pointer("pointerdown", 1, 100, 100, {pointerType: "touch"}); pointer("pointerdown", 2, 200, 100, {pointerType: "touch"});
+      pointer("pointermove", 2, 201, 100, {pointerType: "touch"}); pointer("pointermove", 2, 302, 100, {pointerType: "touch"}); log.pinch = state();
+      pointer("pointerup", 1, 0, 0); pointer("pointerup", 2, 0, 0);
+      key("r"); document.querySelector("#shapes button").click(); log.button = state();
+      key("r"); view.under(box.width / 2, box.height / 2);
+      log.under = view.pixelShown; log.text = document.getElementById("numbers").textContent;
+      view.under(1, 1); log.beside = document.getElementById("numbers").textContent;
+      log.failed = document.getElementById("failed").hidden;
+      return log;""", tmp_path)  # fmt: skip
+    start = found["start"]
+    assert start["eye"] == [0, 0]
+    assert found["eye"]["eye"] == pytest.approx([5, 0])
+    assert found["light"]["light"] != start["light"]
+    assert found["light"]["eye"] == found["eye"]["eye"]
+    changed = {k for k in start if found["keys"][k] != found["light"][k]}
+    assert changed == {"shape", "repeat", "exposure", "detail"}
+    assert found["keys"]["shape"] == "cylinder"
+    assert found["reset"] == start
+    # A drag to the right turns the object to the right: the eye goes left.
+    assert found["dragged"]["eye"][0] > 5
+    assert abs(found["dragged"]["eye"][1]) == pytest.approx(180)
+    assert found["lit"]["eye"] == start["eye"]
+    assert found["lit"]["light"] != start["light"]
+    assert found["wheel"]["zoom"] == pytest.approx(np.exp(0.2))
+    assert found["pinch"]["zoom"] == pytest.approx(2, rel=0.01)
+    assert found["button"]["shape"] == "plane"
+    under = found["under"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        wanted = made("lambert").evaluate(under["uv"], under["light"], under["view"]).reflectance
+    assert under["rgb"] == pytest.approx(list(wanted), abs=1e-3)
+    assert "texel" in found["text"]
+    assert "beside the shape" in found["beside"]
+    assert found["failed"] is True
+
+
+def test_the_address_sets_the_state_and_nonsense_in_it_is_left_out(tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    script = "return view.state;"
+    page.write_text(
+        model.page(made("lambert"), title="x").replace("</body>", ANSWER.format(script))
+    )
+    link = tmp_path / "link.html"
+    link.write_text(
+        "<script>location.replace('page.html#shape=torus&light=10,20&repeat=x&eye=1&zoom=2&no=1')</script>"
+    )
+    seen = browser.load(link, "--virtual-time-budget=4000")
+    state = json.loads(seen.text("out"))
+    assert (state["shape"], state["light"], state["zoom"]) == ("torus", [10, 20], 2)
+    assert (state["repeat"], state["eye"]) == (2, [0, 0])
+
+
+def test_without_webgl2_a_page_says_so(tmp_path: Path) -> None:
+    text = model.page(made("lambert"), title="x").replace(
+        "<main>", "<script>HTMLCanvasElement.prototype.getContext = () => null;</script><main>"
+    )
+    said = probed(text, 'return document.getElementById("failed").innerText;', tmp_path)
+    assert "WebGL2, which this browser" in said
+
+
+def test_hostile_names_are_text(tmp_path: Path) -> None:
+    evil = "</script><img src=x onerror=alert(1)>`${1}`\u2028"
+    header = Header(GRID, channels=(evil, "G", "B"), licence=evil, provenance={evil: evil})
+    material = Lambert(LambertSpec((2, 2)), {"texture": np.ones((2, 2, 3), np.float32)}, header)
+    text = model.page(material, title=evil)
+    assert "<img" not in text
+    said = probed(
+        text, 'return [document.title, document.images.length, document.getElementById("about").textContent];',
+        tmp_path,
+    )  # fmt: skip
+    assert said[0].startswith("</script><img")
+    assert said[1] == 0
+    assert "onerror" in said[2]
+
+
+def test_a_page_fits_a_phone(tmp_path: Path) -> None:
+    frame = tmp_path / "phone.html"
+    (tmp_path / "inner.html").write_text(model.page(made("lambert"), title="x"))
+    frame.write_text(
+        "<iframe id='f' src='inner.html' width='360' height='740'></iframe><pre id='out'></pre>"
+        "<script>f.onload = () => { const d = f.contentDocument, c = d && d.querySelector('canvas');"
+        "out.textContent = d ? [d.documentElement.scrollWidth, c.clientWidth, c.clientHeight].join() : 'closed'; }</script>"
+    )
+    seen = browser.load(frame, "--allow-file-access-from-files", "--virtual-time-budget=4000")
+    wide, across, high = map(int, seen.text("out").split(","))
+    assert wide <= 360
+    assert across == 360
+    assert 300 < high < 600
+
+
+@pytest.mark.parametrize(("small", "most"), [(False, 4.5e6), (True, 2.5e6)])
+def test_a_page_of_a_neumip_of_256_texels_is_small(small: bool, most: float) -> None:
+    from btfkit.materials.neumip.material import NeuMIP
+    from btfkit.materials.neumip.spec import NeuMIPSpec
+
+    # The largest that is published: offset texture, seven channels, nine levels.
+    spec = NeuMIPSpec((256, 256), levels=9)
+    header = Header((256, 256))
+    rng = np.random.default_rng(0)
+    weights = {
+        name: rng.normal(0, 0.3, shape).astype(np.float32)
+        for name, shape in NeuMIP.shapes(spec, header).items()
+    }
+    text = model.page(NeuMIP(spec, weights, header), title="x", small=small)
+    assert 0.5e6 < len(text.encode()) <= most
+    assert not re.search(r"(?:src|href)=|https?://|@import", text)
+
+
+def test_a_store_opens_pair_by_pair(tmp_path: Path) -> None:
+    btf = synth_btf("knit", size=16, lights="9", views="7", samples=2)
+    text = store.page(btf, title="knit")
+    found = probed(text, """
+      const log = {size: [STORE.n, STORE.h, STORE.w], numbers: []};
+      document.getElementById("lights").dispatchEvent(new MouseEvent("click", {clientX: document.getElementById("lights").getBoundingClientRect().left + 5, clientY: document.getElementById("lights").getBoundingClientRect().top + 130}));
+      log.light = STORE.lights[view.state.light];
+      document.dispatchEvent(new KeyboardEvent("keydown", {key: "ArrowRight", shiftKey: true}));
+      log.view = view.state.view;
+      const pair = view.pairOf(view.state.light, view.state.view);
+      log.pair = pair; log.rgb = view.value(pair, 3, 5);
+      log.text = document.getElementById("numbers").textContent;
+      return log;""", tmp_path)  # fmt: skip
+    assert found["size"] == [63, 16, 16]
+    assert found["light"][0] == pytest.approx(btf.light[:, 0].min(), abs=0.2)
+    assert found["view"] == 1
+    truth = btf.texture(found["pair"])[3, 5]
+    peak = max(float(btf.texture(i).max()) for i in range(63))
+    # Half a code of sRGB at its steepest: 2.2 / 255 / 2 of the brightest.
+    np.testing.assert_allclose(found["rgb"], truth, atol=0.006 * peak)
+    picture = tmp_path / "store.png"
+    (tmp_path / "plain.html").write_text(text)
+    assert browser.screenshot(tmp_path / "plain.html", picture).errors == []
+    assert cv2.imread(str(picture)).std() > 10
