@@ -254,12 +254,12 @@ class Rig(ABC):
         description: sections "rig" and "target" of sequence.json, nominal.
     """
 
-    def __init__(self, serial: str, watchdog: Watchdog) -> None:
+    def __init__(self, serial: str, watchdog: Watchdog, *, here: bool = False) -> None:
         self.serial = serial
         self._watchdog = watchdog
         # Stops do not wait behind the call that they are to stop.
         self._stops = Watchdog(f"stops of {serial}")
-        self._owner = Owner(serial)
+        self._owner = Owner(serial, here=here)
         self._open = False
 
     stage: Stage

@@ -13,10 +13,18 @@ from btfkit.errors import DeviceError
 
 @final
 class Owner:
-    """A lock on the rig of one serial number; a killed process lets go of it by itself."""
+    """A lock on the rig of one serial number; a killed process lets go of it by itself.
 
-    def __init__(self, serial: str) -> None:
+    Args:
+        serial: of the rig.
+        here: whether the rig is in this process alone, as a twin is; others have their own.
+    """
+
+    def __init__(self, serial: str, *, here: bool = False) -> None:
         name = re.sub(r"[^A-Za-z0-9._-]", "_", serial) or "rig"
+        self._here = here
+        if here:
+            name += f"-{os.getpid()}"
         self._path = Path(tempfile.gettempdir()) / f"btfkit-{name}.lock"
         self._serial = serial
         self._file: IO[str] | None = None
@@ -47,6 +55,9 @@ class Owner:
     def release(self) -> None:
         """Let go; nothing happens where there is nothing to let go of."""
         if self._file is not None:
+            if self._here:
+                # Nobody waits for it, and no later process has this name.
+                self._path.unlink(missing_ok=True)
             self._file.close()
             self._file = None
 

@@ -89,15 +89,15 @@ def open_rig(serial: str | None = None, *, backend: Any = None, clock: Clock | N
     if len(chosen) != 1:
         asked = "no serial number was named" if serial is None else f"{serial!r} is not there"
         raise DeviceError(f"rigs on the bus: {listing}; {asked}", remedy="--device usb:SERIAL")
-    return UsbRig(chosen[0], clock or WallClock())
+    return UsbRig(chosen[0], clock or WallClock(), here=backend is not None)
 
 
 @final
 class UsbRig(Rig):
     """A rig behind two bulk endpoints; its parts are there once it is open."""
 
-    def __init__(self, found: Found, clock: Clock) -> None:
-        super().__init__(found.serial, Watchdog(f"rig {found.serial}"))
+    def __init__(self, found: Found, clock: Clock, *, here: bool) -> None:
+        super().__init__(found.serial, Watchdog(f"rig {found.serial}"), here=here)
         self._transport = Bulk(found.device, clock)
         self._clock = clock
         self.link = Link(self._transport)

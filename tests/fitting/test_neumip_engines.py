@@ -10,8 +10,7 @@ import torch
 from test_neumip import bumps, material, upper
 
 from btfkit.errors import FitError
-from btfkit.fitting import fit as fitting
-from btfkit.fitting import loop
+from btfkit.fitting import loop, training
 from btfkit.fitting.fit import fit
 from btfkit.fitting.neumip import data
 from btfkit.fitting.neumip import paper as neumip_paper
@@ -225,7 +224,8 @@ def test_no_queries_have_no_answers():
 @pytest.fixture
 def pretended(monkeypatch):
     """A GPU that is the CPU under another name."""
-    monkeypatch.setattr(fitting, "_gpu", lambda: "cpu:0")
+    for module in (training, fitting):
+        monkeypatch.setattr(module, "gpu", lambda: "cpu:0")
 
 
 def test_fit_uses_the_device_and_says_so(pretended, tmp_path):

@@ -139,13 +139,13 @@ def test_ubo2003_parts_are_decoded_alone(
     from btfkit.io import images
 
     decoded: list[str] = []
-    original = images.read
+    original = images.decode
 
-    def counting(name: str, data: bytes, **options: str) -> np.ndarray:
+    def counting(name: str, data: bytes, **options: str) -> images.Image:
         decoded.append(name)
         return original(name, data, **options)
 
-    monkeypatch.setattr(images, "read", counting)
+    monkeypatch.setattr(images, "decode", counting)
     part = Part(rows=slice(8, 40), cols=slice(0, 16), lights=slice(0, 81, 20))
     path = ingest(real_data / "ubo2003_wallpaper", tmp_path / "a.btf.zarr", part=part)
     assert btfkit.open(path).shape == (5, 32, 16, 3)
