@@ -10,6 +10,7 @@ import torch
 from test_neumip import bumps, material, upper
 
 from btfkit.errors import FitError
+from btfkit.fitting import fit as fitting
 from btfkit.fitting import loop, training
 from btfkit.fitting.fit import fit
 from btfkit.fitting.neumip import data
