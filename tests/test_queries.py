@@ -122,6 +122,7 @@ def test_a_damaged_query_file_is_refused(tmp_path: Path, content: bytes, message
         queryfile.read(tmp_path / "q.npz")
 
 
+@pytest.mark.slow
 def test_a_query_file_that_unpacks_to_too_much_is_refused_unread(tmp_path: Path) -> None:
     path = tmp_path / "q.npz"
     with (

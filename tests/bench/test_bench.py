@@ -66,6 +66,7 @@ def test_stores_hold_out_what_fit_holds_out(tmp_path):
     assert (len(found.train), len(found.pictures)) == (20, 5)
 
 
+@pytest.mark.slow
 def test_a_run_reports_the_contracts_errors_and_is_taken_up_again(tmp_path, monkeypatch):
     found = run.run(TINY, tmp_path / "out")
     labels = [(row["label"], row["budget_cpu_s"]) for row in found["cells"]]
@@ -141,6 +142,7 @@ def test_the_verb_prints_one_json_object(tmp_path, capsys):
     assert "neither a file nor a material" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_cells_of_several_calls_are_told_together(tmp_path):
     first = replace(TINY, models=("lambert",))
     run.run(first, tmp_path)
@@ -157,6 +159,7 @@ def test_cells_of_several_calls_are_told_together(tmp_path):
     assert {row["material"] for row in other["cells"]} == {"cobbles", "print"}
 
 
+@pytest.mark.slow
 def test_cells_of_other_machines_and_of_older_versions_are_told(tmp_path):
     found = run.run(replace(TINY, models=("lambert",), materials=("print", "cobbles")), tmp_path)
     assert "Measured elsewhere" not in (tmp_path / "bench.md").read_text()
@@ -199,6 +202,7 @@ def test_processes_may_run_into_one_folder_at_a_time(tmp_path):
     assert len(written) == 14
 
 
+@pytest.mark.slow
 def test_one_rainer20_is_trained_on_all_materials_and_answers_for_each(tmp_path):
     profile = replace(
         TINY, models=("rainer20",), materials=("print", "cobbles"), budgets_cpu_s=(0.05, 0.1)

@@ -125,6 +125,7 @@ def test_projection_and_its_derivatives_are_those_of_kornia():
     np.testing.assert_allclose(by_parameter, jacobians[1].numpy(), rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_tilting_turning_sample_and_the_optimum_are_those_of_automatic_differentiation():
     rng = np.random.default_rng(3)
     rig = turntables.Turntable(rng)
@@ -189,6 +190,7 @@ def test_derivatives_of_a_tilting_turning_sample_and_the_optimum_are_those_of_au
 
 
 @pytest.mark.parametrize("slip_sd", [0.0, 1e-3])
+@pytest.mark.slow
 def test_derivatives_of_every_parameter_of_a_rig_with_spheres_are_differences_of_its_residuals(
     slip_sd,
 ):
@@ -382,6 +384,7 @@ def test_frames_without_a_board_are_refused_with_their_number():
         adjust(nominal(rig), two)
 
 
+@pytest.mark.slow
 def test_collinear_spheres_still_tell_the_light_where_it_is_off_their_line():
     rng = np.random.default_rng(11)
     rig = turntables.Turntable(rng)
@@ -407,6 +410,7 @@ def test_collinear_spheres_still_tell_the_light_where_it_is_off_their_line():
     assert np.isfinite(found.condition)
 
 
+@pytest.mark.slow
 def test_a_light_seen_in_one_sphere_of_one_view_keeps_what_it_does_not_tell():
     rng = np.random.default_rng(12)
     rig = turntables.Turntable(rng)
@@ -443,6 +447,7 @@ def test_a_frame_whose_readings_contradict_its_image_is_named():
         adjust(nominal(rig, spheres=False), seen)
 
 
+@pytest.mark.slow
 def test_small_slips_of_the_axes_are_found_where_they_are_allowed():
     rng = np.random.default_rng(15)
     rig = turntables.Turntable(rng)

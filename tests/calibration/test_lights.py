@@ -44,6 +44,7 @@ def angles(directions, lamps):
 
 
 @pytest.mark.parametrize("scene", [FAR, NEAR])
+@pytest.mark.slow
 def test_outlines_are_found_to_a_twentieth_of_a_pixel(scene):
     stack = np.stack(pictures(scene))
     optics = Optics(scene.width, scene.height, scene.focal_px())
@@ -94,6 +95,7 @@ def test_the_light_file_of_a_folder_is_read_back_as_a_btf(tmp_path):
     assert record["without_light"] == []
 
 
+@pytest.mark.slow
 def test_one_sphere_tells_directions_and_says_that_it_knows_no_distance(tmp_path):
     scene = Scene((((0, 0), 20.0),), width=360, height=360)
     folder = write(tmp_path / "one", [scene.photograph(x, i) for i, x in enumerate(LAMPS[:4])])
@@ -214,6 +216,7 @@ def white_frames(lens=True):
 
 
 @pytest.mark.parametrize("single", [False, True])
+@pytest.mark.slow
 def test_fall_off_is_divided_out_by_white_frames(tmp_path, single):
     whites, vignette = white_frames()
     taken = [p * vignette for p in pictures(FAR)]

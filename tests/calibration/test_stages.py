@@ -182,6 +182,7 @@ def test_missing_flats_are_named_and_a_gain_stands_in(folder):
         stages.calibrate(bare)
 
 
+@pytest.mark.slow
 def test_one_exposure_only_calibrates_and_says_what_it_cannot_tell(folder):
     def single(frame):
         return None if frame.exposure_s == 0.02 and frame.kind not in ("dark", "flat") else frame
@@ -217,6 +218,7 @@ def test_counts_that_pile_up_below_the_saturation_level_are_named(folder):
     stages.calibrate(edited(folder, sensor={"white": 1500.0}))
 
 
+@pytest.mark.slow
 def test_missing_references_leave_their_stages_out_by_name(folder):
     found, _ = stages.calibrate(edited(folder, frames=no("white")))
     assert found.missing == NO_BOARD | {
@@ -294,6 +296,7 @@ def test_without_a_monitor_the_lamp_is_followed_by_references(tmp_path):
     assert "taken as steady" in found.section("lamp").data["note"]
 
 
+@pytest.mark.slow
 def test_a_lamp_that_flickers_without_a_monitor_is_followed_within_each_pose(tmp_path):
     rig = replace(RIG, monitor=False, slow=1.0, drift=0.0, flicker=0.02)
     found, _ = stages.calibrate(Sequence.open(rig.write(tmp_path / "run")))
@@ -315,6 +318,7 @@ def test_a_lamp_that_flickers_without_a_monitor_is_followed_within_each_pose(tmp
     )
 
 
+@pytest.mark.slow
 def test_patches_out_of_the_frame_are_named(folder):
     away = {**FakeRig().document()["target"]["white"], "centre_mm": [80, 0, 0]}
     with pytest.raises(
@@ -323,6 +327,7 @@ def test_patches_out_of_the_frame_are_named(folder):
         stages.calibrate(edited(folder, target={"white": away}))
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_where_it_should_not_is_aimed_by_the_patches(folder, calibrated):
     # 6 and 4 pixels of patches that are 40 x 30 pixels wide and 10 apart.
     camera = RIG.document()["rig"]["camera"]
@@ -338,6 +343,7 @@ def test_a_camera_that_stands_where_it_should_not_is_aimed_by_the_patches(folder
     )
 
 
+@pytest.mark.slow
 def test_a_rig_that_is_not_described_needs_windows_and_directions(folder):
     def directed(frame):
         angle = frame.axes["arm"]
@@ -415,6 +421,7 @@ def last_json(capsys):
     return json.loads(capsys.readouterr().out.splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_the_verb_calibrates_a_sequence_and_keeps_what_it_knows(folder, capsys):
     assert call("calibrate", folder, "--json") == 0
     data = last_json(capsys)

@@ -205,6 +205,7 @@ def test_data_of_any_number_of_channels_guide_and_are_fitted(channels: int) -> N
     )
 
 
+@pytest.mark.slow
 def test_a_fit_beats_lambert_on_a_tiny_btf() -> None:
     tiny = synth_btf("scratched", size=32, lights="25", views="9", samples=2, relief_texels=0.1)
     settings = {"encoder": "false", "texels": "256"}
@@ -250,6 +251,7 @@ def test_equal_seed_and_steps_give_equal_bytes(tiny: BTF, tmp_path: Path) -> Non
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_resumed_fit_takes_the_same_trajectory(
     tiny: BTF, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

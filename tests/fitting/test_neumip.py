@@ -162,6 +162,7 @@ def test_rays_meet_a_ramp_of_heights_where_geometry_says():
         np.testing.assert_allclose(shift, height * du, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_relief_is_found_from_pictures_alone():
     """The heights of a traced relief of 0.48 texels rms; three times what was seen is allowed."""
     rows, cols = np.mgrid[:32, :32] / 32 * 2 * np.pi
@@ -314,6 +315,7 @@ PSNR = {"neumip": 30, "neumip-paper": 20}
 
 
 @pytest.mark.parametrize("model", ["neumip", "neumip-paper"])
+@pytest.mark.slow
 def test_fits_a_btf_better_than_its_mean(model, tmp_path):
     settings = {"batch": "2048"} if model == "neumip" else {}
     report = fit(bumps(), model=model, steps=300, out=tmp_path / "a.safetensors", settings=settings)

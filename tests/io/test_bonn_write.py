@@ -251,6 +251,7 @@ class Endless(Textures):
         return np.einsum("k,khwc->hwc", weights, self._basis)
 
 
+@pytest.mark.slow
 def test_memory_is_bounded_by_factors_and_a_block_of_images(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

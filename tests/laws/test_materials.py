@@ -81,6 +81,7 @@ def test_every_model_is_in_the_contract() -> None:
 
 
 @every_model
+@pytest.mark.slow
 def test_a_model_says_what_it_is_of(model: str) -> None:
     material, btf = fitted(model), tiny()
     assert material.model == model

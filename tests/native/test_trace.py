@@ -574,6 +574,7 @@ def test_a_sample_that_does_not_tile_is_seen_at_its_border_from_outside() -> Non
     np.testing.assert_array_equal(inside, outside)
 
 
+@pytest.mark.slow
 def test_extremes_of_curvature_and_of_views_on_cylinders_end_and_answer() -> None:
     rng = np.random.default_rng(4)
     for depth in (0.0, 0.01):
