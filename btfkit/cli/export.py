@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -27,4 +28,16 @@ def export_verb(bar: Bar, *, model: Path, target: str, out: Path, force: bool) -
     refuse_existing(out, force=force)
     made = export(load(model), target, out, force=force)
     listing = "\n".join(f"  {size:>10,}  {name}" for name, size in made["files"].items())
-    return Outcome(f"{out}: {made['bytes']:,} bytes\n{listing}", {"out": out, **made})
+    return Outcome(
+        f"{out}: {made['bytes']:,} bytes\n{listing}", {"out": out, **made}, then=_next(target, out)
+    )
+
+
+def _next(target: str, out: Path) -> str:
+    """How the example of an export is run."""
+    folder = shlex.quote(str(out))
+    return {
+        "npz": f"python {folder}/evaluate.py queries.npz answers.npz",
+        "cpp": f"cd {folder} && c++ -O3 -std=c++17 example.cpp -o example && ./example",
+        "glsl": f"open {folder}/example.html in a browser",
+    }[target]

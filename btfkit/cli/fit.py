@@ -20,6 +20,7 @@ from btfkit.cli.options import (
     the_only,
 )
 from btfkit.cli.outcome import INTERRUPTED, Outcome, command_line, verb
+from btfkit.cli.preview import of_material, preview_option
 
 if TYPE_CHECKING:
     from btfkit.fitting.report import FitReport
@@ -63,6 +64,7 @@ def _models() -> str:
 @click.option(
     "--full-report", is_flag=True, help="Evaluate every held-out pair, beyond the budget."
 )
+@preview_option
 @seed_option
 @force_option
 def fit_verb(
@@ -78,6 +80,7 @@ def fit_verb(
     resume: bool,
     settings: tuple[tuple[str, str], ...],
     full_report: bool,
+    preview: bool,
     seed: int,
     force: bool,
 ) -> Outcome:
@@ -118,7 +121,8 @@ def fit_verb(
     )
     if report.interrupted:
         return _to_go_on(report)
-    return Outcome(report.line(), report.as_dict(), then=_next(report))
+    left = of_material(report.material, Path(report.out)) if preview and report.out else {}
+    return Outcome(report.line(), {**report.as_dict(), **left}, then=_next(report))
 
 
 def _to_go_on(report: FitReport) -> Outcome:
@@ -132,7 +136,10 @@ def _to_go_on(report: FitReport) -> Outcome:
 
 def _next(report: FitReport) -> str:
     """What one does with a fitted model."""
+    from btfkit.materials import PROGRAMS
+
     out = shlex.quote(report.out or "")
     if report.material.model == "neubtf" and not report.untrained:
         return f"btfkit propagate guidance.png --model {out}"
-    return f"btfkit render {out} --shape sphere"
+    drawn = report.material.model in PROGRAMS
+    return f"btfkit view {out}" if drawn else f"btfkit render {out} --shape sphere"

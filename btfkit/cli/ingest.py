@@ -10,6 +10,7 @@ import click
 from btfkit.cli.bar import Bar
 from btfkit.cli.options import SliceType, WindowType, force_option, out_option, seed_option
 from btfkit.cli.outcome import Outcome, verb
+from btfkit.cli.preview import of_btf, preview_option
 
 
 @verb(
@@ -31,6 +32,7 @@ from btfkit.cli.outcome import Outcome, verb
 )
 @click.option("--dtype", type=click.Choice(["float16", "float32"]), help="Of the stored textures.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Workers; by default one a processor.")
+@preview_option
 @seed_option
 @force_option
 def ingest_verb(
@@ -44,6 +46,7 @@ def ingest_verb(
     lights: slice | None,
     dtype: str | None,
     jobs: int | None,
+    preview: bool,
     seed: int,
     force: bool,
     **options: object,
@@ -80,6 +83,7 @@ def ingest_verb(
             "channels": btf.channels,
             "format": btf.provenance["format"],
             "assumed": btf.provenance.get("assumed", {}),
+            **(of_btf(btf, path) if preview else {}),
         },
         then=f"btfkit fit {shlex.quote(str(path))}",
     )

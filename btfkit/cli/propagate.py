@@ -10,6 +10,7 @@ import click
 from btfkit.cli.bar import Bar
 from btfkit.cli.options import force_option, out_option, seed_option, stem, the_only
 from btfkit.cli.outcome import Outcome, verb
+from btfkit.cli.preview import of_material, preview_option
 
 
 @verb("propagate", example="btfkit propagate guidance.png --model wool.neubtf.safetensors")
@@ -18,6 +19,7 @@ from btfkit.cli.outcome import Outcome, verb
 @out_option("The model to write; by default GUIDANCE.neubtf.safetensors here")
 @click.option("--scale", type=click.FloatRange(min=0, min_open=True), default=1.0)
 @click.option("--tileable", is_flag=True, help="Make the guidance tile first.")
+@preview_option
 @seed_option
 @force_option
 def propagate_verb(
@@ -28,6 +30,7 @@ def propagate_verb(
     out: Path | None,
     scale: float,
     tileable: bool,
+    preview: bool,
     seed: int,
     force: bool,
 ) -> Outcome:
@@ -53,5 +56,6 @@ def propagate_verb(
     if scale < 1:
         found["consistency_db"] = alike = consistency(guidance, source, scale=scale)
         line += f"; {alike:.1f} dB from the material at full size, shrunk"
-    then = f"btfkit render {shlex.quote(str(final))} --shape sphere"
+    found |= of_material(material, final) if preview else {}
+    then = f"btfkit view {shlex.quote(str(final))}"
     return Outcome(line, found, then=then)

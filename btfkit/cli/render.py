@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from btfkit.shapes.closed import Floats
 
 _ANGLES = NumbersType("THETA,PHI", float)
-_LIGHT = (40.0, 45.0)
 _MOST_SIDE = 16384
 _SIDE = 512
 # Bytes of a BTF that is read as a whole.
@@ -36,7 +35,7 @@ btfkit render wool.btf.zarr -o wool.exr --shape torus --env hall.hdr --repeat 3"
 @click.option("--shape", default="plane", show_default=True,
               help="plane, sphere, cylinder, torus or FILE.obj.")  # fmt: skip
 @click.option("--light", "lights", type=_ANGLES, multiple=True,
-              help="Far away, degrees; repeatable. 40,45 where there is no --env.")  # fmt: skip
+              help="Far away, degrees; repeatable. Key, fill and rim where none is.")  # fmt: skip
 @click.option("--env", type=click.Path(path_type=Path), help="Surroundings, *.hdr or *.exr.")
 @click.option("--env-turn", type=float, default=0.0, help="Turn them about y, degrees.")
 @click.option("--view", type=_ANGLES, default="0,0", show_default=True, help="To the eye, degrees.")
@@ -47,8 +46,8 @@ btfkit render wool.btf.zarr -o wool.exr --shape torus --env hall.hdr --repeat 3"
 )
 @click.option("--spp", type=click.IntRange(1, 65536), help="Rays a pixel; as needed by default.")
 @click.option("--exposure", type=float, default=0.0, show_default=True, help="Stops, PNG only.")
-@click.option("--background", type=NumbersType("R,G,B", float), default="0,0,0", show_default=True,
-              help="Linear, PNG only; an EXR has its cover as A.")  # fmt: skip
+@click.option("--background", type=NumbersType("R,G,B", float),
+              help="Linear, PNG only; black, or grey without --light and --env.")  # fmt: skip
 @seed_option
 @force_option
 def render_verb(
@@ -65,7 +64,7 @@ def render_verb(
     size: tuple[int, int] | None,
     spp: int | None,
     exposure: float,
-    background: tuple[float, float, float],
+    background: tuple[float, float, float] | None,
     seed: int,
     force: bool,
 ) -> Outcome:
@@ -73,10 +72,11 @@ def render_verb(
 
     Angles are in the object's frame: x right, y up, z towards the viewer of --view 0,0; THETA from
     z, PHI from x towards y. A white surface that faces one --light is 1. A plane fills the picture.
+    Without --light and --env a studio lights it: key, fill and rim light before grey.
     """
     from btfkit import sources
     from btfkit.files import refuse_existing
-    from btfkit.render import picture
+    from btfkit.render import picture, studio
     from btfkit.render.environment import Environment
     from btfkit.render.preview import Scene, enough_samples, render
     from btfkit.shapes.catalogue import shape_of
@@ -84,7 +84,7 @@ def render_verb(
     start = time.perf_counter()
     if size is not None:
         _check_size(size)
-    if not all(math.isfinite(number) for number in (env_turn, exposure, *background)):
+    if not all(math.isfinite(number) for number in (env_turn, exposure, *(background or ()))):
         raise click.UsageError("--env-turn, --exposure and --background take finite numbers")
     final = out or Path(stem(source) + ".png")
     picture.check_name(final)
@@ -96,8 +96,10 @@ def render_verb(
     # A plane fills the picture, which by default has the shape of the material.
     w, h = size or _shaped(material.header.aspect if shape == "plane" else 1.0)
     channels = material.header.channels
-    if not lights and env is None:
-        lights = (_LIGHT,)
+    in_studio = not lights and env is None
+    if in_studio:
+        lights = studio.ANGLES
+    irradiance = studio.IRRADIANCE if in_studio else (1.0,) * len(lights)
     surroundings = None
     if env is not None:
         radiance = picture.read_surroundings(env, channels=channels)
@@ -107,6 +109,7 @@ def render_verb(
         shape_of(shape, repeat=repeat, aspect=material.header.aspect, picture=w / h),
         _directions("--light", lights),
         surroundings,
+        irradiance,
     )
     eye = _directions("--view", (view,))[0]
     samples = spp or enough_samples(scene, eye, (h, w))
@@ -114,11 +117,13 @@ def render_verb(
     about = {
         "source": source, "model": material.model, "licence": material.header.licence,
         "quantity": "radiance; 1 is a white diffuser that faces one light",
-        "shape": shape, "lights_deg": lights, "env": env, "env_turn_deg": env_turn,
+        "shape": shape, "lights_deg": lights, "irradiance": irradiance,
+        "env": env, "env_turn_deg": env_turn,
         "view_deg": view, "repeat": repeat, "spp": samples, "seed": seed,
     }  # fmt: skip
     picture.write(
-        seen, final, channels=channels, exposure=exposure, background=background,
+        seen, final, channels=channels, exposure=exposure,
+        background=background or (studio.GREY if in_studio else (0, 0, 0)),
         about=plain(about), force=force,
     )  # fmt: skip
     seconds = time.perf_counter() - start

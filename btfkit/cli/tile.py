@@ -10,6 +10,7 @@ import click
 from btfkit.cli.bar import Bar
 from btfkit.cli.options import force_option, out_option
 from btfkit.cli.outcome import Outcome, verb
+from btfkit.cli.preview import of_btf, of_material, preview_option
 
 # Below this nobody sees that a drift was taken away.
 _SEEN = 0.005
@@ -20,8 +21,11 @@ _SEEN = 0.005
 @out_option("To write; by default INPUT with .tile before its suffix, here")
 @click.option("--drift/--no-drift", default=True, show_default=True,
               help="Take away what makes one end brighter than the other.")  # fmt: skip
+@preview_option
 @force_option
-def tile_verb(bar: Bar, *, source: Path, out: Path | None, drift: bool, force: bool) -> Outcome:
+def tile_verb(
+    bar: Bar, *, source: Path, out: Path | None, drift: bool, preview: bool, force: bool
+) -> Outcome:
     """Make INPUT tile: an image, a BTF store or a NeuBTF model."""
     from btfkit.cli.tiling import tile_file
 
@@ -36,9 +40,27 @@ def tile_verb(bar: Bar, *, source: Path, out: Path | None, drift: bool, force: b
         )
     return Outcome(
         line,
-        {"out": final, **found.record(), "seam_ratio": found.seam_ratio},
+        {
+            "out": final,
+            **found.record(),
+            "seam_ratio": found.seam_ratio,
+            **(_pictured(final) if preview else {}),
+        },
         then=_next(final),
     )
+
+
+def _pictured(final: Path) -> dict[str, Path]:
+    """The preview of a tile that is no picture itself."""
+    if final.suffix == ".zarr":
+        from btfkit.io import open as open_btf
+
+        return of_btf(open_btf(final), final)
+    if final.suffix == ".safetensors":
+        from btfkit.materials.file import load
+
+        return of_material(load(final), final)
+    return {}
 
 
 def _next(final: Path) -> str:

@@ -43,4 +43,8 @@ def view_verb(bar: Bar, *, source: Path, out: Path | None, small: bool, force: b
     with whole(final, force=force) as partial:
         partial.write_text(text, encoding="utf-8")
     size = final.stat().st_size
-    return Outcome(f"{final}: {size:,} bytes", {"out": final, "kind": kind, "bytes": size})
+    return Outcome(
+        f"{final}: {size:,} bytes",
+        {"out": final, "kind": kind, "bytes": size},
+        then=f"open {final} in a browser",
+    )

@@ -12,8 +12,8 @@ _LITTER = {
     "thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx", "@eadir", "$recycle.bin",
     "system volume information", "lost+found", "icon\r",
 }  # fmt: skip
-# A native store is no image folder: it may lie in the folder that it was made of.
-_STORE = ".btf.zarr"
+# A native store is no image folder: it may lie in the folder that it was made of, its preview too.
+_OURS = (".btf.zarr", ".preview.png")
 
 
 def key(name: str) -> str:
@@ -22,9 +22,9 @@ def key(name: str) -> str:
 
 
 def counts(name: str) -> bool:
-    """Whether one part of a path is the user's: not hidden, no litter, no store."""
+    """Whether one part of a path is the user's: not hidden, no litter, not ours."""
     low = name.lower()
-    return not (low.startswith(".") or low in _LITTER or low.endswith(_STORE))
+    return not (low.startswith(".") or low in _LITTER or low.endswith(_OURS))
 
 
 def all_count(path: PurePosixPath) -> bool:

@@ -39,12 +39,14 @@ class Scene:
         lights: (n, 3) directions of distant lights; each alone makes a white surface
             that faces it 1.
         environment: light from everywhere, or None.
+        irradiance: (n,) of each light on a surface that faces it; None is 1 of each.
     """
 
     material: Material
     shape: Shape
     lights: Floats
     environment: Environment | None = None
+    irradiance: Sequence[float] | None = None
 
 
 class Rendering(NamedTuple):
@@ -180,9 +182,10 @@ class _Painter:
         scene, count = self._scene, len(seen.uv)
         total = np.zeros((count, len(scene.material.header.channels)))
         opacity: Floats = np.ones(count)
-        one = np.ones((1, 1))
+        strength = scene.irradiance or [1.0] * len(scene.lights)
         sources: list[tuple[Floats, Floats]] = [
-            (np.broadcast_to(light, (count, 3)), one) for light in scene.lights
+            (np.broadcast_to(light, (count, 3)), np.full((1, 1), irradiance))
+            for light, irradiance in zip(scene.lights, strength, strict=True)
         ]
         if scene.environment is not None:
             sources.append(scene.environment.sample(numbers, seen.frame[:, 2]))

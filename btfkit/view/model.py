@@ -8,7 +8,7 @@ from btfkit.export.numbers import literal
 from btfkit.export.package import about
 from btfkit.export.sections import filled, whole_text
 from btfkit.materials.base import Material
-from btfkit.render.picture import to_rgb
+from btfkit.render.studio import visible
 from btfkit.view.page import composed, in_script, section
 
 
@@ -64,14 +64,8 @@ def _said(material: Material) -> list[tuple[str, str]]:
 
 def _rgb(channels: tuple[str, ...]) -> str:
     """A vec3 of the channels' linear RGB; of channels without colour their mean."""
-    try:
-        matrix = to_rgb(channels)
-    except ValueError:
-        return f"vec3(({' + '.join(f'value[{k}]' for k in range(len(channels)))}) / " + (
-            f"{literal(len(channels))})"
-        )
     rows = [
         " + ".join(f"{literal(m)} * value[{k}]" for k, m in enumerate(column) if m)
-        for column in matrix.T
+        for column in visible(channels).T
     ]
     return f"vec3({', '.join(row or '0.0' for row in rows)})"

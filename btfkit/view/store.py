@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from btfkit import colour, directions
 from btfkit.btf import BTF
-from btfkit.render.picture import to_rgb
+from btfkit.render.studio import visible
 from btfkit.view.page import composed, in_script
 
 # Texels that a page carries, all pairs together: 5 MB as base64.
@@ -64,7 +64,7 @@ def thumbnails(btf: BTF, *, progress: Callable[[int, int], None] | None = None) 
     pairs = np.unique(np.linspace(0, n - 1, min(n, most)).astype(np.intp))
     shrink = max(math.sqrt(len(pairs) * h * w / MOST_TEXELS), 1.0)
     size = max(int(h / shrink), 1), max(int(w / shrink), 1)
-    matrix = _shown(btf.channels)
+    matrix = visible(btf.channels)
     linear = np.zeros((len(pairs), *size, 3), np.float32)
     masked = 0
     for k, pair in enumerate(pairs):
@@ -90,14 +90,6 @@ def _shrunk(texture: NDArray[np.float32], size: tuple[int, int]) -> NDArray[Any]
         for c in range(0, texture.shape[2], 4)
     ]
     return np.concatenate([part.reshape(*size, -1) for part in parts], axis=2)
-
-
-def _shown(channels: tuple[str, ...]) -> NDArray[np.float32]:
-    """(c, 3) from channels to RGB; of channels without colour their mean."""
-    try:
-        return to_rgb(channels)
-    except ValueError:
-        return np.full((len(channels), 3), 1 / len(channels), np.float32)
 
 
 def _said(btf: BTF, small: Thumbnails, peak: float) -> list[tuple[str, str]]:

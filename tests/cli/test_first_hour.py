@@ -756,7 +756,8 @@ def test_auto_names_the_model_that_it_took(here: Path, capsys: pytest.CaptureFix
     ("arguments", "then"),
     [
         (["ingest", "wool.btf.zarr", "-o", "b.btf.zarr"], "btfkit fit b.btf.zarr"),
-        (["fit", "--model", "lambert"], "btfkit render wool.lambert.safetensors --shape sphere"),
+        (["fit", "--model", "lambert"], "btfkit view wool.lambert.safetensors"),
+        (["view", "wool.btf.zarr"], "open wool.html in a browser"),
         (["convert", "wool.btf.zarr", "-o", "u", "--as", "manifest"], "btfkit info u"),
         (["synth", "print", "-o", "p.exr", "--as", "relief", "--size", "8"],
          "btfkit render p.exr --shape sphere"),
