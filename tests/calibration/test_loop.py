@@ -12,27 +12,9 @@ from btfkit.devices.capture import plan as plans
 from btfkit.devices.capture.run import measure
 from btfkit.devices.faults import Faults
 from btfkit.devices.twin.log import Twin, TwinLog
-from btfkit.devices.twin.truth import truth
+from btfkit.devices.twin.truth import blurred, truth
 
 EDGE = 6
-
-
-def expected(fine, blur):
-    """Texels (h, w, c) of twice the size under the blur that a texture states.
-
-    Args:
-        fine: (2h, 2w, c) traced with a footprint of half a fine texel.
-        blur: (3,) covariance in texels^2 (uu, uv, vv), larger than a fine texel's.
-    """
-    h, w, c = fine.shape
-    # Beside what is asked: the tracer's own half texel, and the mean of two by two.
-    add = 4 * blur - [0.5, 0, 0.5]
-    y, x = 2 * np.pi * np.fft.fftfreq(2 * h)[:, None], 2 * np.pi * np.fft.fftfreq(2 * w)
-    kernel = np.exp(-0.5 * (add[0] * x**2 + 2 * add[1] * x * y + add[2] * y**2))
-    wide = np.pad(fine, ((h // 2, h // 2), (w // 2, w // 2), (0, 0)), mode="reflect")
-    blurred = np.fft.ifft2(np.fft.fft2(wide, axes=(0, 1)) * kernel[..., None], axes=(0, 1)).real
-    inner = blurred[h // 2 : h // 2 + h, w // 2 : w // 2 + w]
-    return inner.reshape(h // 2, 2, w // 2, 2, c).mean((1, 3))
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +40,7 @@ def test_a_captured_btf_matches_the_tracer_at_its_stated_footprint_to_forty_deci
     for pair in range(len(btf)):
         found = btf.texture(pair)
         blur = np.nanmean(btf.textures.footprints(pair).blur, (0, 1))
-        wanted = expected(true.texture(pair).astype(float), blur)
+        wanted = blurred(true.texture(pair), blur)
         inner = slice(EDGE, -EDGE), slice(EDGE, -EDGE)
         seen = np.isfinite(found[inner])
         # Hot pixels of the sensor are left out, and no more.
