@@ -55,7 +55,7 @@ def picture(here: Path) -> None:
         ("a raw frame, brightened", _raw(here / "rig", pair)),
         ("rectified", to_srgb((found / white).clip(0, 1))),
         ("truth", to_srgb((wanted / white).clip(0, 1))),
-        ("difference, × 5", (0.5 + 5 * (found - wanted) / white).clip(0, 1)),
+        ("difference, × 20", (0.5 + 20 * (found - wanted) / white).clip(0, 1)),
     ]
     for place, (title, image) in enumerate(panels):
         axis = figure.add_subplot(1, 5, 2 + place)
@@ -66,14 +66,14 @@ def picture(here: Path) -> None:
 
 
 def _raw(folder: Path, pair: int) -> Any:
-    """(h, w) the longest exposure of a pair, 0 to 1, brightened for the eye."""
+    """(h, w) the shortest exposure of a pair, 0 to 1, brightened for the eye."""
     from btfkit.sequence import Sequence
 
     sequence = Sequence.open(folder)
     group = list(sequence.groups("sample").values())[pair]
-    last = max(group, key=lambda i: sequence.frames[i].need("exposure_s"))
+    first = min(group, key=lambda i: sequence.frames[i].need("exposure_s"))
     black, white = sequence.sensor.need("black"), sequence.sensor.need("white")
-    return ((sequence.image(last) - black) / (white - black)).clip(0, 1) ** 0.45
+    return ((sequence.image(first) - black) / (white - black)).clip(0, 1) ** 0.45
 
 
 def _rig(axis: Any, captured: Any, document: Path) -> None:

@@ -26,7 +26,7 @@ _PILE, _NEAR_TOP = 50, 16
 # A frame without light has equal counts too.
 _DARKEST = 0.1
 # Electrons a count whose photon noise is far below rounding.
-_NOISELESS_GAIN = 1e12
+NOISELESS_GAIN = 1e12
 _LIT = ("sample", "white", "colour", "reference", "target")
 
 
@@ -131,7 +131,7 @@ def _gain(
         details["notes"].append(
             "no photon noise: variances hold read noise and rounding alone (synthetic)"
         )
-        return NoiseModel(_NOISELESS_GAIN, read or 0.0, white, black, current)
+        return NoiseModel(NOISELESS_GAIN, read or 0.0, white, black, current)
     pairs = _flat_pairs(sequence)
     if pairs:
         try:

@@ -58,7 +58,11 @@ def calibrate_verb(
 
 def _of_sequence(data: dict[str, Any]) -> str:
     found = data["figures"]
-    parts = [f"gain {found['gain_e_per_count']:.3f} e/count, read noise {found['read_e']:.2f} e"]
+    parts = ["no photon noise"]
+    if found["photon_noise"]:
+        parts = [
+            f"gain {found['gain_e_per_count']:.3f} e/count, read noise {found['read_e']:.2f} e"
+        ]
     if "lamp_drift" in found:
         parts.append(f"lamp drift {100 * found['lamp_drift']:.2f} %")
     if "scale_sd" in found:

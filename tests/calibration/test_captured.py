@@ -182,7 +182,7 @@ def test_stray_light_of_a_window_is_that_of_the_whole_frame(cfa):
     rig = SimpleNamespace(stray=stray, radiometry=radiometry)
     every = captured._EVERY
     found = captured._without_stray(rig, part(window), part((every, every)), window)
-    expected = stray.removed(whole, shading, colours).radiance[window]
+    expected = stray.removed(whole, radiometry.lens((120, 160)), colours).radiance[window]
     # A fortieth of a slope's mean at the most, of which 2 % are stray light.
     np.testing.assert_allclose(found.radiance, expected, rtol=5e-4)
     assert (found.radiance < whole.radiance[window]).all()
