@@ -22,6 +22,8 @@ from btfkit.relief.trace import geometry
 Image = NDArray[np.float32]
 # Rays a side of a pixel, by default.
 GRID = 2
+# Rays a side of each of these on the sample, whose threads are finer than a pixel.
+_FINER = 2
 # Shading of the plate is smooth: it is worked out every fourth pixel or so, and read between.
 _SHADING = 2.0 / 640
 _DARKEST_COSINE = 1e-3
@@ -144,9 +146,21 @@ class Scene:
         inside = np.asarray((np.abs(where) < half).all(-1))
         if not inside.any():
             return
-        xy = where[inside]
-        points = np.column_stack([xy, np.zeros(len(xy), np.float32)])
         lamp = self._lamp_points(placed, inside)
+        # A ray's neighbours tell how the plane runs within its part of a pixel.
+        down, across = (np.gradient(where, axis=axis)[inside] for axis in (0, 1))
+        steps = (np.arange(_FINER, dtype=np.float32) + np.float32(0.5)) / _FINER - np.float32(0.5)
+        total = np.zeros((int(inside.sum()), 3), np.float32)
+        for row in steps:
+            for col in steps:
+                xy = np.clip(where[inside] + row * down + col * across, -half, half)
+                total += self._traced(xy, lamp, placed)
+        fine[inside] = total / _FINER**2
+
+    def _traced(self, xy: Image, lamp: Image, placed: Placed) -> Image:
+        """(b, 3) pi x radiance of the sample at (b, 2) mm under (b, 3) points of the lamp."""
+        half = np.array([self._size_mm[0] / 2, self._size_mm[1] / 2], np.float32)
+        points = np.column_stack([xy, np.zeros(len(xy), np.float32)])
         to_lamp = lamp - points
         to_camera = placed.camera.astype(np.float32) - points
         distance2 = (to_lamp * to_lamp).sum(-1)
@@ -163,7 +177,7 @@ class Scene:
         irradiance = np.float32(layout.LAMP_MM**2) / distance2
         # Below its horizon the sample's plane hides the lamp.
         irradiance = np.where(light[:, 2] > 0, irradiance, 0)
-        fine[inside] = traced.rgb * irradiance[:, None]
+        return np.asarray(traced.rgb * irradiance[:, None])
 
     def _lamp_points(self, placed: Placed, inside: NDArray[np.bool_]) -> Image:
         """A point of the lamp's disc for each ray: the rays of a pixel share the disc out."""
