@@ -22,7 +22,7 @@ PLAN = (
     '{"views": 4, "lights": 3, "reference_every": 30, "whites": 3, "colours": 1, "targets": 16, '
     '"spheres": 8}'
 )
-HANDFUL = ("mosaic", "defocus", "shot-noise", "prnu", "axes")
+HANDFUL = ("mosaic", "defocus", "shot-noise")
 BTFKIT = Path(sys.executable).with_name("btfkit")
 
 
