@@ -69,8 +69,8 @@ def test_a_captured_btf_matches_the_tracer_at_its_stated_footprint_to_forty_deci
     assert found.psnr() >= 40, figures
     assert min(figures.values()) > 39, figures
     assert found.view.max() < 0.02
-    # Asked are 0.05 at 16 views; here the rig's readings alone are off by 0.02 to 0.04.
-    assert found.light.max() < 0.08
+    # Highlights to 0.01 or 0.02 px are 0.03 to 0.06 degrees each; axes and lamp share sixty.
+    assert found.light.max() < 0.06
 
 
 @pytest.mark.slow
@@ -92,14 +92,16 @@ def test_a_captured_run_becomes_a_material_on_a_new_image_by_three_commands(capt
 
 
 @pytest.mark.slow
-def test_a_perfect_rig_without_a_mosaic_comes_closer(tmp_path):
-    (tmp_path / "plan.json").write_text(json.dumps({**PLAN, "views": 2, "lights": 2, "targets": 8}))
+def test_a_perfect_rig_matches_to_fifty_decibels(tmp_path):
+    (tmp_path / "plan.json").write_text(
+        json.dumps({**PLAN, "views": [[0, 0], [45, 120]], "lights": 2, "targets": 10})
+    )
     typed(tmp_path, "capture", "--device", "mock", "--plan", "plan.json", "-o", "run", "--seed", 618,
           "--perfect")  # fmt: skip
     said = typed(tmp_path, "calibrate", "run")
     assert said["figures"]["photon_noise"] is False
     found = compare(tmp_path / "run")
-    assert found.psnr(0) > 50
+    assert found.psnr() >= 50
     assert found.view.max() < 0.005
     assert found.light.max() < 0.02
     np.testing.assert_allclose(found.scale, 1, atol=0.005)
