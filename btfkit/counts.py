@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import io
+import struct
 import tempfile
 import zlib
 from pathlib import PurePosixPath
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.errors import FormatError
+from btfkit.tifftags import Directory, below, chain_of
 
 Counts = NDArray[Any]
 
@@ -20,6 +22,15 @@ CODED = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"}
 FLOATING = {".exr", ".hdr"}
 RAW = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".raw"}
 SUFFIXES = CODED | FLOATING | RAW
+# What a TIFF may be whose counts are read as they are: grey of which 0 is black, or RGB.
+_SAMPLES_OF = {1: 1, 2: 3}
+_PHOTOMETRIC = {0: "grey of which 0 is white", 3: "a palette", 4: "a mask", 5: "inks (CMYK)",
+                6: "YCbCr", 8: "CIE L*a*b*", 32803: "a colour filter array",
+                34892: "linear sensor values"}  # fmt: skip
+# Format and bits of a sample.
+_DEPTHS = {(1, 8), (1, 16), (3, 32)}
+_CURVES = {291: "a grey response curve", 301: "a transfer function", 342: "a transfer range"}
+_PNG_KINDS = {0: "grey", 2: "RGB", 3: "a palette", 4: "grey with alpha", 6: "RGB with alpha"}
 
 
 def is_frame(name: str) -> bool:
@@ -39,7 +50,8 @@ def read(name: str, data: bytes) -> Counts:
         top. RAW files give the mosaic of their visible area, black level not subtracted.
 
     Raises:
-        FormatError: not an image, damaged, or a RAW file without rawpy.
+        FormatError: not an image, damaged, not laid out as plain counts, or a RAW file without
+            rawpy.
     """
     suffix = PurePosixPath(name).suffix.lower()
     if suffix in FLOATING:
@@ -72,6 +84,7 @@ def _read_codes(name: str, data: bytes) -> Counts:
     import cv2
 
     check_whole(name, data)
+    _check_layout(name, data)
     # Without IGNORE_ORIENTATION a camera that was held upright would turn some of the frames.
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
@@ -136,3 +149,53 @@ def check_whole(name: str, data: bytes) -> None:
         if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
             raise FormatError(name, f"chunk {kind!r} of the PNG is damaged", remedy="copy it again")
         at = end + 4
+
+
+def _check_layout(name: str, data: bytes) -> None:
+    """Refuse what decoders turn into other counts without a word.
+
+    Raises:
+        FormatError: a TIFF or PNG that is not one picture of grey or RGB counts as they are.
+    """
+    if data.startswith(b"\x89PNG"):
+        bits, kind = data[24], data[25]
+        if kind not in (0, 2) or bits not in (8, 16):
+            what = _PNG_KINDS.get(kind, f"colour type {kind}")
+            raise _no_counts(name, f"holds {what} of {bits} bits")
+    if data[:4] not in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return
+    try:
+        chain = chain_of(data)
+        pages = [*chain, *(each for d in chain for each in below(data, d))]
+        if len(pages) != 1:
+            raise _no_counts(name, f"holds {len(pages)} pictures")
+        fault = _fault_of(pages[0])
+    except (struct.error, ValueError, KeyError) as error:
+        raise FormatError(name, "not a readable image", remedy="copy it again") from error
+    if fault:
+        raise _no_counts(name, fault)
+
+
+def _fault_of(picture: Directory) -> str | None:
+    """Why a picture of a TIFF is no plain counts; None where it is."""
+    photometric, samples = picture.number(262, -1), picture.number(277, 1)
+    if photometric not in _SAMPLES_OF:
+        return f"holds {_PHOTOMETRIC.get(photometric, f'photometric interpretation {photometric}')}"
+    if samples != _SAMPLES_OF[photometric]:
+        more = "beside grey" if photometric == 1 else "of RGB"
+        return f"has {samples} samples a pixel {more}"
+    if samples > 1 and picture.number(284, 1) != 1:
+        return "has its colours in separate planes"
+    depths = {(form, bits) for form in picture.values(339) or (1,) for bits in picture.values(258)}
+    if len(depths) != 1 or not depths <= _DEPTHS:
+        listed = ", ".join(f"{bits} of format {form}" for form, bits in sorted(depths)) or "1"
+        return f"has samples of {listed} bits"
+    return next((f"declares {what}" for tag, what in _CURVES.items() if tag in picture), None)
+
+
+def _no_counts(name: str, found: str) -> FormatError:
+    return FormatError(
+        name, f"{found}; counts of a sensor are one picture of grey, 0 black, or RGB, 8 or 16 bits "
+        "a sample or floats of 32, colours side by side, without alpha",
+        remedy="write the frames as 16-bit grey PNG or TIFF",
+    )  # fmt: skip

@@ -1,4 +1,5 @@
 """From images to a neural material on a new guidance image: the three commands of the README.
+Then a virtual rig measures such a cloth itself, and its BTF meets the truth.
 
 Run it with `make demo`; pictures and models land in `demo/`. Where BTFKIT_REAL_DATA names a folder
 with UBO2003 images, those are the source (one view: the material then knows lights only).
@@ -15,6 +16,8 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+
+import virtual_rig
 
 HERE = Path("demo")
 BTFKIT = Path(sys.executable).with_name("btfkit").absolute()
@@ -60,7 +63,7 @@ def overview() -> None:
 
 
 def main() -> None:
-    """The three commands, then pictures."""
+    """The three commands, then pictures; then the virtual rig."""
     HERE.mkdir(exist_ok=True)
     make_guidance()
     source = measured_folder()
@@ -78,7 +81,8 @@ def main() -> None:
     sphere = "--shape sphere --light 40,45 --size 384x384 --repeat 2"
     run(f"render guidance.neubtf.safetensors -o sphere.png {sphere}", makes="sphere.png")
     overview()
-    print(f"pictures: {HERE}/overview.png, {HERE}/sphere.png")
+    virtual_rig.measure(HERE, run)
+    print(f"pictures: {HERE}/overview.png, {HERE}/sphere.png, {HERE}/rig.png")
 
 
 if __name__ == "__main__":

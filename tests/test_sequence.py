@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+import re
+from io import BytesIO
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from btfkit import counts, documents
 from btfkit.errors import CalibrationError, FormatError
@@ -220,3 +224,73 @@ def test_what_is_no_frame_is_refused(name, message):
 def test_a_png_holds_one_or_three_planes_of_16_bits():
     with pytest.raises(ValueError, match=r"expected uint16 \(h, w\[, 3\]\)"):
         counts.encode_png(np.zeros((3, 3)))
+
+
+def tiff(pixels, *more, **options):
+    file = BytesIO()
+    with tifffile.TiffWriter(file) as writer:
+        for each in (pixels, *more):
+            writer.write(each, metadata=None, **options)
+    return file.getvalue()
+
+
+GREY = np.random.default_rng(0).integers(0, 65535, (6, 8), endpoint=True).astype("u2")
+COLOURS = np.random.default_rng(1).integers(0, 65535, (6, 8, 3), endpoint=True).astype("u2")
+
+
+@pytest.mark.parametrize("byteorder", ["<", ">"])
+@pytest.mark.parametrize(
+    ("pixels", "options"),
+    [
+        (GREY, {"photometric": "minisblack"}),
+        (GREY.astype("u1"), {"photometric": "minisblack", "rowsperstrip": 2}),
+        (GREY.astype("f4"), {"photometric": "minisblack"}),
+        (COLOURS, {"photometric": "rgb"}),
+        (np.tile(GREY, (6, 4)), {"photometric": "minisblack", "tile": (16, 16)}),
+    ],
+)
+def test_counts_of_a_tiff_are_those_that_were_written(pixels, options, byteorder):
+    file = BytesIO()
+    with tifffile.TiffWriter(file, byteorder=byteorder) as writer:
+        writer.write(pixels, metadata=None, **options)
+    np.testing.assert_array_equal(counts.read("a.tif", file.getvalue()), pixels)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (tiff(GREY, photometric="miniswhite"), "grey of which 0 is white"),
+        (tiff(np.moveaxis(COLOURS, 2, 0), photometric="rgb", planarconfig="separate"),
+         "its colours in separate planes"),
+        (tiff(np.dstack([COLOURS, GREY]), photometric="rgb", extrasamples=["unassalpha"]),
+         "4 samples a pixel of RGB"),
+        (tiff(np.dstack([GREY, GREY]), photometric="minisblack", planarconfig="contig",
+              extrasamples=["unspecified"]), "2 samples a pixel beside grey"),
+        (tiff(GREY, GREY, photometric="minisblack"), "holds 2 pictures"),
+        (tiff(GREY.astype("u1"), photometric="palette",
+              colormap=np.zeros((3, 256), "u2")), "a palette"),
+        (tiff(GREY.astype("i2"), photometric="minisblack"), "16 of format 2 bits"),
+        (tiff(GREY.astype("u4"), photometric="minisblack"), "32 of format 1 bits"),
+        (tiff(GREY.astype("f8"), photometric="minisblack"), "64 of format 3 bits"),
+        (tiff(GREY, photometric="minisblack", extratags=[(301, 3, 4, (0, 1, 2, 3), True)]),
+         "declares a transfer function"),
+        (tiff(GREY, photometric=32803, extratags=[(33421, 3, 2, (2, 2), True),
+                                                  (33422, 1, 4, (0, 1, 1, 2), True)]),
+         "a colour filter array"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)  # fmt: skip
+def test_a_tiff_that_is_no_plain_counts_is_refused_by_name(data, message):
+    with pytest.raises(FormatError, match=rf"a\.tif: .*{re.escape(message)}.*16-bit grey PNG"):
+        counts.read("a.tif", data)
+
+
+@pytest.mark.parametrize(
+    ("mode", "message"),
+    [("P", "a palette"), ("LA", "grey with alpha"), ("RGBA", "RGB with alpha"), ("1", "1 bits")],
+)
+def test_a_png_that_is_no_plain_counts_is_refused_by_name(mode, message):
+    file = BytesIO()
+    Image.fromarray(COLOURS.astype("u1")).convert(mode).save(file, "PNG")
+    with pytest.raises(FormatError, match=message):
+        counts.read("a.png", file.getvalue())

@@ -354,13 +354,11 @@ def _without_stray(
     """As `Stray.removed`, with the frame's mean from a part of its pixels."""
     if rig.stray is None:
         return merged
-    shading = rig.radiometry.shading
     h, w = merged.radiance.shape[:2]
-    lens: Floats = np.ones((h, w)) if shading is None else shading[window]
     rows, columns = sparse.radiance.shape[:2]
-    few: Floats = np.ones((rows, columns)) if shading is None else shading[_EVERY, _EVERY]
+    lens, few = _lens(rig, merged, window), _lens(rig, sparse, (_EVERY, _EVERY))
     if merged.radiance.ndim == 3:
-        spread: Floats = rig.stray.share * frame_means(sparse, few, None) / lens[..., None]
+        spread: Floats = rig.stray.share * frame_means(sparse, few, None) / lens
     else:
         # An odd step meets the colours of a mosaic in the order of the mosaic itself, and windows
         # begin with a whole cell of it.
@@ -368,6 +366,14 @@ def _without_stray(
         own = rig.radiometry.colours((h, w))
         spread = (added[0] if own is None else added[own]) / lens
     return replace(merged, radiance=(merged.radiance - spread).astype(np.float32))
+
+
+def _lens(rig: _Rig, merged: Merged, window: tuple[slice, slice]) -> Floats:
+    """Shading of the lens over a window of the frame, of the shape of what was merged there."""
+    shading, shape = rig.radiometry.shading, merged.radiance.shape
+    if shading is None:
+        return np.ones(shape)
+    return shading.reshape(len(shading), -1, *shape[2:])[window]
 
 
 def _corrected(

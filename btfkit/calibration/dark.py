@@ -179,6 +179,8 @@ def unrounded_variance(mean: float, variance: float) -> float:
     Args:
         mean, variance: of the rounded values.
     """
+    if variance <= 0:
+        return 0.0
     plain = variance - QUANTISATION
     if plain > 0.5:
         return plain

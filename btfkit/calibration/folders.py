@@ -12,6 +12,7 @@ import numpy as np
 from btfkit import documents
 from btfkit.calibration import falloff, report, rti, stages
 from btfkit.calibration.calibration import NAME, Calibration
+from btfkit.calibration.sensor_stage import NOISELESS_GAIN
 from btfkit.errors import CalibrationError
 from btfkit.files import refuse_existing
 from btfkit.sequence import TABLE, Sequence
@@ -73,6 +74,7 @@ def figures(found: Calibration) -> dict[str, Any]:
     out: dict[str, Any] = {}
     if "radiometry" in found.sections:
         noise = found.sections["radiometry"].data["noise"]
+        out |= {"photon_noise": noise["gain_e_per_count"] < NOISELESS_GAIN}
         out |= {"gain_e_per_count": noise["gain_e_per_count"], "read_e": noise["read_e"]}
     if "lamp" in found.sections:
         out["lamp_drift"] = found.sections["lamp"].data["drift"]

@@ -16,6 +16,7 @@ from btfkit.calibration.camera_model import Camera
 from btfkit.calibration.geometry import Geometry
 from btfkit.calibration.intrinsics import SingleCamera, calibrate_camera
 from btfkit.calibration.kinematics import Axis, Kinematics, Rigid
+from btfkit.calibration.merge import SATURATED
 from btfkit.calibration.mirrors import highlight
 from btfkit.calibration.radiometry import Radiometry
 from btfkit.errors import CalibrationError
@@ -66,7 +67,7 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
     board = Board.from_json(_section(sequence.target, "board", "target"))
     groups = list(sequence.groups("target").values())
     frames = [sequence.frames[group[0]] for group in groups]
-    pictures = [_grey(radiometry, sequence, group) for group in groups]
+    pictures = [_grey(radiometry, sequence, group)[0] for group in groups]
     single = calibrate_camera(pictures, board)
     sightings, first = [], None
     for frame, view in zip(frames, single.views, strict=True):
@@ -91,7 +92,7 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
         sighting
         for group in sequence.groups("sphere").values()
         for sighting in find_highlights(
-            _grey(radiometry, sequence, group), rough, sequence.frames[group[0]]
+            *_grey(radiometry, sequence, group), rough, sequence.frames[group[0]]
         )
     ]
     return Found(adjust(rough, sightings, spheres) if spheres else alone, single)
@@ -135,11 +136,14 @@ def nominal(sequence: Sequence) -> Geometry:
     )  # fmt: skip
 
 
-def find_highlights(picture: Floats, rough: Geometry, frame: Frame) -> list[SphereSighting]:
+def find_highlights(
+    picture: Floats, saturated: NDArray[np.bool_], rough: Geometry, frame: Frame
+) -> list[SphereSighting]:
     """The lamp in the mirror spheres of one frame: the middle of each bright spot.
 
     Args:
-        picture: (h, w) radiance; NaN where it saturates.
+        picture: (h, w) radiance; NaN where a pixel saturates or is dead.
+        saturated: (h, w) which of the two: a saturated pixel is bright, a dead one says nothing.
         rough: the geometry, good to some part of a sphere.
         frame: that `picture` was merged from.
     """
@@ -147,7 +151,9 @@ def find_highlights(picture: Floats, rough: Geometry, frame: Frame) -> list[Sphe
         return []
     to_camera = rough.sample_to_camera(frame.axes)
     light = to_camera(rough.light_position(LAMP, frame.axes))
-    bright = np.nan_to_num(picture, nan=float(np.nanmax(picture, initial=0.0)))
+    bright = np.where(saturated, float(np.nanmax(picture, initial=0.0)), picture)
+    dead = np.isnan(bright)
+    bright[dead] = ndimage.median_filter(np.nan_to_num(bright), 3)[dead]
     found = []
     for sphere, (centre, radius) in enumerate(zip(rough.spheres_mm, rough.radii_mm, strict=True)):
         middle = to_camera(centre)
@@ -184,19 +190,24 @@ def _spot(bright: Floats, expected: Floats, reach: float) -> Floats | None:
     return np.array([low[0] + column, low[1] + row])
 
 
-def _grey(radiometry: Radiometry, sequence: Sequence, group: tuple[int, ...]) -> Floats:
-    """(h, w) radiance of an achromatic target, the colours of a mosaic brought to one scale."""
+def _grey(
+    radiometry: Radiometry, sequence: Sequence, group: tuple[int, ...]
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """(h, w) radiance of an achromatic target, the colours of a mosaic brought to one scale.
+
+    NaN where a pixel tells nothing; and where that is because it saturates.
+    """
     merged = radiometry.radiance(sequence, group)
-    radiance = merged.radiance.astype(float)
+    radiance, saturated = merged.radiance.astype(float), merged.validity == SATURATED
     if radiance.ndim == 3:
-        return np.asarray(radiance.mean(axis=2))
+        return np.asarray(radiance.mean(axis=2)), np.asarray(saturated.any(axis=2))
     colours = radiometry.colours((radiance.shape[0], radiance.shape[1]))
     if colours is None:
-        return radiance
+        return radiance, saturated
     out = radiance.copy()
     for c in range(3):
         out[colours == c] /= max(float(np.nanpercentile(radiance[colours == c], 90)), 1e-12)
-    return out
+    return out, saturated
 
 
 def _board_pose(sequence: Sequence) -> Rigid:

@@ -28,7 +28,8 @@ class Radiometry:
         noise: black, gain, read noise, response; dark current at `temperature_c`.
         cfa: colours of the mosaic, "none" without one.
         temperature_c: of the dark current, None where it is not known. doubling_k: kelvin.
-        shading: (h, w) of the lens, part of the noise model's sensitivity; None without flats.
+        shading: (h, w) of the lens, part of the noise model's sensitivity, or (h, 3 w) as
+            `as_plane` lays it; None without flats.
         factors: nominal exposure in seconds to what it is to be multiplied by.
     """
 
@@ -87,6 +88,10 @@ class Radiometry:
         """What a nominal exposure is to be multiplied by; 1 where no overlap told it."""
         near = [f for t, f in self.factors.items() if abs(t / exposure_s - 1) < 1e-6]
         return near[0] if near else 1.0
+
+    def lens(self, shape: tuple[int, ...]) -> Floats:
+        """The shading for a whole frame (h, w) or (h, w, 3); 1 without flats."""
+        return np.ones(shape) if self.shading is None else self.shading.reshape(shape)
 
     def colours(self, shape: tuple[int, int]) -> NDArray[np.intp] | None:
         """(h, w) channel of each pixel of the mosaic; None without one."""

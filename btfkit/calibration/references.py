@@ -55,7 +55,8 @@ class Scene:
         found = self.radiometry.radiance(self.sequence, indices, lamp=lamp)
         if self.stray is None:
             return found
-        return self.stray.removed(found, self.radiometry.shading, self.colours(found))
+        lens = self.radiometry.lens(found.radiance.shape)
+        return self.stray.removed(found, lens, self.colours(found))
 
     def colours(self, merged: Merged) -> NDArray[np.intp] | None:
         """(h, w) channel of each pixel of a mosaic."""
@@ -121,9 +122,8 @@ def measure_stray(scene: Scene) -> tuple[Stray, dict[str, Any]]:
         frame = scene.sequence.frames[group[0]]
         merged = scene.merged(group)
         colours = scene.colours(merged)
-        shape = merged.radiance.shape[:2]
-        shading = np.ones(shape) if scene.radiometry.shading is None else scene.radiometry.shading
-        mean = frame_means(merged, shading, colours)
+        lens = scene.radiometry.lens(merged.radiance.shape)
+        mean = frame_means(merged, lens, colours)
         shift = scene.shift(merged, frame)
         for patch in greys:
             mask = scene.mask(merged, patch, frame, shift)
@@ -131,7 +131,7 @@ def measure_stray(scene: Scene) -> tuple[Stray, dict[str, Any]]:
             expected.append(
                 float(np.mean(patch["reflectance"])) * scene.lit(patch, frame, _near(scene, frame))
             )
-            around.append(mean / shading[mask].mean())
+            around.append(mean / lens[mask].mean(axis=0))
     found = fit_stray(values, expected, around)
     return found, {"share": found.share, **found.fitted.record()}
 

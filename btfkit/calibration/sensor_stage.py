@@ -14,7 +14,7 @@ from btfkit.calibration.exposures import refine_exposures
 from btfkit.calibration.noise import NoiseModel
 from btfkit.calibration.radiometry import Radiometry, as_plane
 from btfkit.calibration.response import fit_linearity, fit_sensitivity
-from btfkit.calibration.transfer import exposure_pairs, photon_transfer
+from btfkit.calibration.transfer import exposure_pairs, lacks_photon_noise, photon_transfer
 from btfkit.errors import CalibrationError
 from btfkit.sequence import Sequence
 
@@ -25,6 +25,8 @@ _MOST_DARKS, _MOST_FLATS, _MOST_GROUPS = 24, 24, 4
 _PILE, _NEAR_TOP = 50, 16
 # A frame without light has equal counts too.
 _DARKEST = 0.1
+# Electrons a count whose photon noise is far below rounding.
+NOISELESS_GAIN = 1e12
 _LIT = ("sample", "white", "colour", "reference", "target")
 
 
@@ -41,10 +43,13 @@ def fit_sensor(sequence: Sequence) -> tuple[Radiometry, dict[str, Any]]:
         CalibrationError: what neither frames nor sequence.json tell, and how to add it.
     """
     _check_iso(sequence)
-    _check_saturation(sequence)
     details: dict[str, Any] = {"notes": []}
+    # Of a real rig frames without noise are copies or averages, and refused.
+    noiseless = bool(sequence.document.get("synthetic")) and _noiseless(sequence)
+    if not noiseless:
+        _check_saturation(sequence)
     dark = _dark(sequence, details)
-    noise = _gain(sequence, dark, details)
+    noise = _gain(sequence, dark, details, noiseless=noiseless)
     flats = _some(sequence, "flat", _MOST_FLATS)
     shading = None
     if flats:
@@ -92,28 +97,48 @@ def _dark(sequence: Sequence, details: dict[str, Any]) -> Dark | None:
     return dark
 
 
-def _gain(sequence: Sequence, dark: Dark | None, details: dict[str, Any]) -> NoiseModel:
+def _noiseless(sequence: Sequence) -> bool:
+    """Whether flats scatter no more where they are brighter."""
+    black, white = float(sequence.sensor.need("black")), float(sequence.sensor.need("white"))
+    return lacks_photon_noise([planes for _, planes in _flat_pairs(sequence)], black, white)
+
+
+def _flat_pairs(sequence: Sequence) -> list[tuple[str, tuple[NDArray[Any], NDArray[Any]]]]:
+    """Up to eight pairs of flat frames of one exposure, and the name of each first."""
+    flats = [sequence.frames[i] for i in sequence.of_kind("flat")]
+    times = [frame.need("exposure_s") for frame in flats]
+    groups = [tuple(sorted(frame.axes.items())) for frame in flats]
+    indices = sequence.of_kind("flat")
+    return [
+        (
+            flats[a].file,
+            (as_plane(sequence.image(indices[a])), as_plane(sequence.image(indices[b]))),
+        )
+        for a, b in exposure_pairs(times, groups)[:8]
+    ]
+
+
+def _gain(
+    sequence: Sequence, dark: Dark | None, details: dict[str, Any], *, noiseless: bool
+) -> NoiseModel:
     """The noise model without response, from pairs of flats or from sequence.json."""
     sensor = sequence.sensor
     white = float(sensor.need("white"))
     black: Any = sensor.black if dark is None else dark.black
     current = 0.0 if dark is None else dark.current
     read = None if dark is None else dark.read
-    flats = sequence.of_kind("flat")
-    times = [sequence.frames[i].need("exposure_s") for i in flats]
-    groups = [tuple(sorted(sequence.frames[i].axes.items())) for i in flats]
-    pairs = exposure_pairs(times, groups)[:8]
+    if noiseless:
+        details["notes"].append(
+            "no photon noise: variances hold read noise and rounding alone (synthetic)"
+        )
+        return NoiseModel(NOISELESS_GAIN, read or 0.0, white, black, current)
+    pairs = _flat_pairs(sequence)
     if pairs:
-        planes = [
-            (as_plane(sequence.image(flats[a])), as_plane(sequence.image(flats[b])))
-            for a, b in pairs
-        ]
         try:
-            found = photon_transfer(planes, black, white, read=read)
+            found = photon_transfer([planes for _, planes in pairs], black, white, read=read)
         except CalibrationError as error:
-            first = sequence.frames[flats[0]].file
             raise CalibrationError(
-                f"{first} and others: {error.message}", remedy=error.remedy
+                f"{pairs[0][0]} and others: {error.message}", remedy=error.remedy
             ) from error
         details["transfer"] = found.record()
         return NoiseModel(found.gain, found.read, white, black, current)

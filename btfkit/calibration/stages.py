@@ -31,7 +31,7 @@ from btfkit.sequence import Sequence as Frames
 Progress = Callable[[float, float], None]
 ORDER = ("radiometry", "lamp", "geometry", "stray", "white", "colour")
 # Raised with what a stage computes: sections of older code are made again.
-_REVISION = {"radiometry": 1, "lamp": 1, "geometry": 1, "stray": 1, "white": 1, "colour": 1}
+_REVISION = {"radiometry": 1, "lamp": 1, "geometry": 2, "stray": 1, "white": 1, "colour": 1}
 _NEEDED = {"radiometry"}
 
 

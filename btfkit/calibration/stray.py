@@ -29,34 +29,33 @@ class Stray:
     share: float
     fitted: Fitted
 
-    def removed(
-        self, merged: Merged, shading: Floats | None, colours: NDArray[np.intp] | None
-    ) -> Merged:
+    def removed(self, merged: Merged, lens: Floats, colours: NDArray[np.intp] | None) -> Merged:
         """A merged frame without it.
 
         Args:
             merged: (h, w) or (h, w, 3), flat-fielded.
-            shading: (h, w) that the flat was divided by: stray light has not the lens's shading.
+            lens: shading of its shape that the flat was divided by: stray light lacks it.
             colours: (h, w) channel of each pixel of a mosaic; None otherwise.
         """
         if self.share == 0:
             return merged
-        lens = np.ones(merged.radiance.shape[:2]) if shading is None else shading
         added = self.share * frame_means(merged, lens, colours)
         if colours is not None:
             spread = added[colours]
         else:
             spread = np.broadcast_to(added, merged.radiance.shape)
-        lens = lens if merged.radiance.ndim == 2 else lens[..., None]
         radiance = (merged.radiance - spread / lens).astype(np.float32)
         return Merged(radiance, merged.variance, merged.validity)
 
 
-def frame_means(merged: Merged, shading: Floats, colours: NDArray[np.intp] | None) -> Floats:
+def frame_means(merged: Merged, lens: Floats, colours: NDArray[np.intp] | None) -> Floats:
     """(c,) mean radiance on the sensor, before the flat was divided out; what saturates counts
     as the brightest that does not.
+
+    Args:
+        merged: (h, w) or (h, w, 3), flat-fielded. lens: shading, of its shape.
+        colours: (h, w) channel of each pixel of a mosaic; None otherwise.
     """
-    lens = shading if merged.radiance.ndim == 2 else shading[..., None]
     seen = merged.radiance * lens
     bright = float(np.nanmax(seen)) if np.isfinite(seen).any() else 0.0
     seen = np.where(np.isfinite(seen), seen, bright)

@@ -68,14 +68,13 @@ def photon_transfer(
     Raises:
         CalibrationError: no pair, a pair of two sizes, or no variance to see.
     """
-    points = [p for i, pair in enumerate(pairs) for p in _points(i, *pair, black, white)]
-    if not points:
+    signal, variance, count = _curve(pairs, black, white)
+    if not len(signal):
         raise CalibrationError(
             f"none of {len(pairs)} pairs of flat frames has {_FEWEST} pixels between the noise and "
             "saturation",
             remedy="capture two flat frames at each of several exposures below saturation",
         )
-    signal, variance, count = np.array(points).T
     if np.ptp(signal) < 0.2 * signal.max() and read is None:
         raise CalibrationError(
             f"the flat frames span {signal.min():.0f} to {signal.max():.0f} counts above black: "
@@ -90,8 +89,38 @@ def photon_transfer(
     return _line(signal, variance, count, read)
 
 
-def _line(signal: Floats, variance: Floats, count: Floats, read: float | None) -> Transfer:
-    """The straight line through the points, weighted by what each can scatter."""
+def lacks_photon_noise(
+    pairs: Sequence[tuple[Any, Any]], black: Any, white: float, *, read: float | None = None
+) -> bool:
+    """Whether bright pixels scatter no more than dark ones, as no real sensor's do.
+
+    Args:
+        pairs, black, white, read: as in `photon_transfer`, which refuses such frames.
+    """
+    signal, variance, count = _curve(pairs, black, white)
+    if not len(signal):
+        return False
+    if not variance.max() > 2 * QUANTISATION:
+        return True
+    answer, *_ = _solution(signal, variance, count, read)
+    return not answer[0] > 0
+
+
+def _curve(
+    pairs: Sequence[tuple[Any, Any]], black: Any, white: float
+) -> tuple[Floats, Floats, Floats]:
+    """Signal, variance and count (b,) of all pairs."""
+    points = [p for i, pair in enumerate(pairs) for p in _points(i, *pair, black, white)]
+    signal, variance, count = np.array(points).reshape(-1, 3).T
+    return signal, variance, count
+
+
+def _solution(
+    signal: Floats, variance: Floats, count: Floats, read: float | None
+) -> tuple[Floats, Floats, float, NDArray[np.bool_], Floats]:
+    """Slope and, where `read` is None, the variance in the dark; covariance, condition, points
+    used, and the variances (b,) that the line expects.
+    """
     floor = 0.0 if read is None else read**2
     target = variance - QUANTISATION - floor
     design = signal[:, None] if read is not None else np.stack([signal, np.ones_like(signal)], 1)
@@ -104,6 +133,12 @@ def _line(signal: Floats, variance: Floats, count: Floats, read: float | None) -
         weight = count / (2 * expected**2)
         answer, covariance, condition, used = solved(design, target, weight, start=answer)
     expected = np.maximum(design @ answer, 0) + QUANTISATION + floor
+    return answer, covariance, condition, used, expected
+
+
+def _line(signal: Floats, variance: Floats, count: Floats, read: float | None) -> Transfer:
+    """The straight line through the points, weighted by what each can scatter."""
+    answer, covariance, condition, used, expected = _solution(signal, variance, count, read)
     slope = float(answer[0])
     if not slope > 0:
         raise CalibrationError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ def calibrate_verb(
     run again. A folder of photographs with one or several mirror spheres in view gives their
     light directions (.lp), and positions where several spheres tell them.
     """
+    from btfkit.calibration.calibration import NAME
     from btfkit.calibration.folders import Photographs, calibrate_photographs, calibrate_sequence
     from btfkit.sequence import TABLE
 
@@ -46,14 +48,21 @@ def calibrate_verb(
         raise FileNotFoundError(f"{source} is not a folder")
     if (source / TABLE).exists():
         data = calibrate_sequence(source, out, force=force, progress=bar)
-        return Outcome(_of_sequence(data), data)
+        # A document elsewhere is not read along with the sequence.
+        beside = data["out"] == source / NAME
+        then = f"btfkit ingest {shlex.quote(str(source))}" if beside else None
+        return Outcome(_of_sequence(data), data, then=then)
     data = calibrate_photographs(source, out, Photographs(**options), force=force, progress=bar)
-    return Outcome(_of_lights(data), data)
+    return Outcome(_of_lights(data), data, then=f"btfkit ingest {shlex.quote(str(data['out']))}")
 
 
 def _of_sequence(data: dict[str, Any]) -> str:
     found = data["figures"]
-    parts = [f"gain {found['gain_e_per_count']:.3f} e/count, read noise {found['read_e']:.2f} e"]
+    parts = ["no photon noise"]
+    if found["photon_noise"]:
+        parts = [
+            f"gain {found['gain_e_per_count']:.3f} e/count, read noise {found['read_e']:.2f} e"
+        ]
     if "lamp_drift" in found:
         parts.append(f"lamp drift {100 * found['lamp_drift']:.2f} %")
     if "scale_sd" in found:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -210,4 +211,4 @@ def _measured(
         writer.write(traced(out), truth, force=force, progress=bar)
         data["truth"] = truth
         line += f"; truth in {truth}"
-    return Outcome(line, data)
+    return Outcome(line, data, then=f"btfkit calibrate {shlex.quote(str(out))}")

@@ -152,7 +152,7 @@ def test_a_sample_seen_from_below_has_no_valid_texel(run):
         btfkit.open(edited(run, below))
 
 
-@pytest.mark.parametrize("cfa", ["none", "RGGB"])
+@pytest.mark.parametrize("cfa", ["none", "RGGB", "three colours"])
 def test_stray_light_of_a_window_is_that_of_the_whole_frame(cfa):
     from types import SimpleNamespace
 
@@ -165,11 +165,18 @@ def test_stray_light_of_a_window_is_that_of_the_whole_frame(cfa):
     rows, columns = np.mgrid[:120, :160]
     shading = 1 - 0.2 * ((rows - 60) ** 2 + (columns - 80) ** 2) / 10000
     noise = NoiseModel(gain=2.0, read=1.0, white=4095.0, black=0.0, dark=0.0)
-    radiometry = Radiometry(noise, cfa, shading=shading)
+    three = cfa == "three colours"
+    if three:
+        # Every colour has a shading of its own; maps hold them side by side.
+        shading = (shading[..., None] * [1, 0.9, 0.8]).reshape(120, -1)
+    radiometry = Radiometry(noise, "none" if three else cfa, shading=shading)
     colours = radiometry.colours((120, 160))
     radiance = 100 + rows + 0.5 * columns + (0 if colours is None else 70 * colours)
+    if three:
+        radiance = radiance[..., None] * [1.0, 2.0, 0.5]
+    shape = radiance.shape
     whole = Merged(
-        radiance.astype(np.float32), np.ones((120, 160), np.float32), np.zeros((120, 160), np.uint8)
+        radiance.astype(np.float32), np.ones(shape, np.float32), np.zeros(shape, np.uint8)
     )
     stray = Stray(0.02, Fitted({"share": 0.02}, {}, 1.0, 0.0))
 
@@ -182,7 +189,7 @@ def test_stray_light_of_a_window_is_that_of_the_whole_frame(cfa):
     rig = SimpleNamespace(stray=stray, radiometry=radiometry)
     every = captured._EVERY
     found = captured._without_stray(rig, part(window), part((every, every)), window)
-    expected = stray.removed(whole, shading, colours).radiance[window]
+    expected = stray.removed(whole, radiometry.lens(shape), colours).radiance[window]
     # A fortieth of a slope's mean at the most, of which 2 % are stray light.
     np.testing.assert_allclose(found.radiance, expected, rtol=5e-4)
     assert (found.radiance < whole.radiance[window]).all()

@@ -12,10 +12,12 @@ from btfkit.calibration.bundle import Sighting, SphereSighting, adjust
 from btfkit.calibration.bundle_problem import Problem
 from btfkit.calibration.camera_model import Camera
 from btfkit.calibration.geometry import Geometry
+from btfkit.calibration.geometry_stage import LAMP, find_highlights
 from btfkit.calibration.intrinsics import calibrate_camera
 from btfkit.calibration.kinematics import Axis, Kinematics, Rigid
 from btfkit.calibration.mirrors import highlight
 from btfkit.errors import CalibrationError
+from btfkit.sequence import Frame
 
 CAMERA = Camera(turntables.WIDTH, turntables.HEIGHT, turntables.TRUTH)
 BOARD = Board(turntables.SQUARES, turntables.SQUARE, turntables.MARKER)
@@ -507,3 +509,26 @@ def test_a_geometry_comes_back_from_its_json():
     np.testing.assert_array_equal(
         back.light_position("lamp", at), geometry.light_position("lamp", at)
     )
+
+
+def test_a_saturated_highlight_is_found_beside_a_dead_pixel():
+    camera = Camera(160, 160, np.array([1500.0, 1500, 80, 80, 0, 0, 0, 0, 0]))
+    geometry = Geometry(
+        camera, Rigid(np.diag([1.0, -1, -1]), np.array([0.0, 0, 300])), Kinematics((), {}),
+        spheres_mm=np.array([[0.0, 0, -2]]), radii_mm=np.array([8.0]),
+        lights_mm={LAMP: np.array([250.0, 100, 600])},
+    )  # fmt: skip
+    pose = geometry.sample_to_camera({})
+    spot = highlight(pose(geometry.spheres_mm), pose(geometry.lights_mm[LAMP])[None],
+                     geometry.radii_mm)  # fmt: skip
+    true = camera.project(spot)[0]
+    rows, columns = np.mgrid[:160, :160]
+    square = (columns - true[0]) ** 2 + (rows - true[1]) ** 2
+    picture = 1 + 1e3 * np.exp(-0.5 * square / 1.2**2)
+    saturated = picture > 700
+    picture[saturated] = np.nan
+    dead = tuple(np.rint(true[::-1]).astype(int) - [9, 6])
+    picture[dead] = np.nan
+    (found,) = find_highlights(picture, saturated, geometry, Frame("a.png", "sphere", {}))
+    # A spot with its top cut off stays about its middle.
+    np.testing.assert_allclose(found.highlights[LAMP], true, atol=0.05)

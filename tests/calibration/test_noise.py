@@ -9,7 +9,11 @@ from sensors import FakeSensor
 from btfkit.calibration.dark import fit_dark, unrounded_variance
 from btfkit.calibration.noise import NoiseModel
 from btfkit.calibration.response import fit_linearity, fit_sensitivity
-from btfkit.calibration.transfer import exposure_pairs, photon_transfer
+from btfkit.calibration.transfer import (
+    exposure_pairs,
+    lacks_photon_noise,
+    photon_transfer,
+)
 from btfkit.errors import CalibrationError
 
 SIZE = (192, 256)
@@ -103,6 +107,20 @@ def test_photon_transfer_finds_gain_and_read_noise():
     # At 50 counts of signal shot noise is five times the read noise.
     assert free.read == pytest.approx(0.4, abs=0.1)
     assert free.fitted.condition < 1e3
+
+
+def test_frames_without_photon_noise_are_told_from_those_with_it():
+    pairs = flat_pairs(FakeSensor(), (0.02, 0.1, 0.4, 1))
+    assert not lacks_photon_noise(pairs, 200.0, 4095)
+    mean = [np.rint(200 + 1500 * t * SHADING).astype(np.uint16) for t in (0.1, 0.4, 1)]
+    assert lacks_photon_noise([(frame, frame) for frame in mean], 200.0, 4095)
+    # Read noise alone is the same everywhere; known from the darks, it leaves nothing.
+    rng = np.random.default_rng(0)
+    quiet = [[frame + np.rint(rng.normal(0, 2, SIZE)) for _ in range(2)] for frame in mean]
+    assert lacks_photon_noise([tuple(pair) for pair in quiet], 200.0, 4095, read=2.01)
+    # Frames that saturate say neither.
+    full = np.full(SIZE, 4095, np.uint16)
+    assert not lacks_photon_noise([(full, full)], 200.0, 4095)
 
 
 def test_photon_transfer_leaves_a_pair_out_that_moved():

@@ -433,9 +433,13 @@ def test_the_verb_calibrates_a_sequence_and_keeps_what_it_knows(folder, capsys):
         "http://purl.org", ""
     ).replace("http://creativecommons.org", "")
     assert call("calibrate", folder) == 0
-    assert "nothing: all inputs are unchanged" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "nothing: all inputs are unchanged" in said.out
+    assert f"next: btfkit ingest {folder}\n" in said.err
     out = folder.parent / "other.json"
     assert call("calibrate", folder, "-o", out) == 0
+    # What lies elsewhere is not read along with the sequence.
+    assert "next:" not in capsys.readouterr().err
     assert call("calibrate", folder, "-o", out) == 1
     assert "exists; --force" in capsys.readouterr().err
 

@@ -48,7 +48,9 @@ def test_a_measurement_with_faults_and_its_truth(plan, tmp_path, capsys):
     assert len(package.open(store)) == len(sequence.groups("sample")) == 2
     assert (out / "watch.html").exists()
     assert call("capture", "--device", "mock", "-o", out, "--resume") == 0
-    assert ", 0 taken now" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert ", 0 taken now" in said.out
+    assert f"next: btfkit calibrate {out}\n" in said.err
 
 
 def test_a_dry_run_says_order_time_and_storage_and_writes_nothing(capsys, tmp_path, monkeypatch):

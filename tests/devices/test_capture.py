@@ -392,6 +392,19 @@ def test_a_lamp_that_never_settles_ends_the_run():
         Engine(rig, plan, Nowhere()).run()
 
 
+def test_spheres_are_seen_from_above_and_tilted_and_always_whole():
+    steps = steps_of(plans.from_document("p", {**SMALL, "spheres": 8}), DESCRIPTION, AXES)
+    poses = [step.places for step in steps if step.kind == "sphere"]
+    tilts = [math.degrees(pose["camera_arm"]) for pose in poses]
+    assert sorted(map(round, tilts)) == [0] * 4 + [40] * 4
+    centres = np.array([[*at, -layout.SUNK_MM] for at in layout.SPHERES_AT])
+    radius = layout.SPHERE_MM * DESCRIPTION["camera"]["focal_px"][0] / layout.CAMERA_MM
+    for pose in poses:
+        seen = Aim(DESCRIPTION).pixels(pose, centres)
+        assert (seen > radius).all()
+        assert (seen < np.array([640, 480]) - radius).all()
+
+
 def test_references_stand_first_last_and_between():
     plan = plans.from_document("p", {**SMALL, "views": 6, "lights": 5, "reference_every": 10})
     steps = steps_of(plan, DESCRIPTION, AXES)

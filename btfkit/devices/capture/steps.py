@@ -18,7 +18,7 @@ from btfkit.relief.synth import direction_set
 
 # What a metered bracket is metered on: an area of the target, the whole frame, or its highlights.
 SAMPLE, WHITE, FRAME, HIGHLIGHT = "sample", "white", "frame", "highlight"
-_STEEPEST_TARGET_DEG, _TARGET_LIGHT_DEG = 72.0, 20.0
+_STEEPEST_TARGET_DEG, _TARGET_LIGHT_DEG, _SPHERE_TILT_DEG = 72.0, 20.0, 40.0
 # Guess at metered times, for estimates alone.
 _GUESS_S = 0.02
 
@@ -185,6 +185,13 @@ def _targets(count: int) -> tuple[Floats, Floats]:
 
 
 def _spheres(count: int) -> tuple[Floats, Floats]:
-    """From above, lamps spread as far down as spheres show them."""
+    """From above and tilted in turn, lamps spread as far down as spheres show them.
+
+    From above alone a sphere's height and the lamp's distance would move the highlights alike.
+    """
     lights = direction_set(str(count)).astype(np.float64) if count else np.zeros((0, 3))
-    return np.tile([0.0, 0.0, 1.0], (count, 1)), lights
+    number = np.arange(count)
+    tilt = np.where(number % 2 == 1, _SPHERE_TILT_DEG, 0.0)
+    # About the shorter side of the frame, which keeps all spheres within it.
+    around = np.where(number % 4 == 3, 180.0, 0.0)
+    return _degrees(tilt.tolist(), around.tolist()), lights

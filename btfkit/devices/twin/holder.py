@@ -39,7 +39,9 @@ class Plate:
             across * layout.SQUARE_MM + margin, down * layout.SQUARE_MM + margin
         )  # fmt: skip
         self._scale = texels_per_mm
-        self.drawing = _board_drawing(self.size_mm, texels_per_mm).copy()
+        grey = _board_drawing(self.size_mm, texels_per_mm)
+        self.drawing: Image = np.zeros((*grey.shape, 4), np.float32)
+        self.drawing[..., :3] = grey[..., None]
         half = layout.MOUNT_MM / 2
         self._fill((-half, half), (-half, half), (_MOUNT,) * 3)
         for patch, shift in zip(target["patches"], truth.displaced, strict=False):
@@ -76,15 +78,14 @@ class Plate:
         _fill(self.drawing, self._scale, x, y, (*reflectance, white))
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=2)
 def _board_drawing(size_mm: tuple[float, float], scale: float) -> Image:
-    """(H, W, 4) of cloth and board: thousands of modules, the same for every twin."""
+    """(H, W) of cloth and board: thousands of modules, the same for every twin."""
     w, h = (round(side * scale) for side in size_mm)
-    drawing = np.zeros((h, w, 4), np.float32)
-    drawing[..., :3] = _CLOTH
+    drawing = np.full((h, w, 1), _CLOTH, np.float32)
     across, down = layout.BOARD
     left, top = -across * layout.SQUARE_MM / 2, down * layout.SQUARE_MM / 2
-    _fill(drawing, scale, (left, -left), (-top, top), (_PAPER, _PAPER, _PAPER, 0.0))
+    _fill(drawing, scale, (left, -left), (-top, top), (_PAPER,))
     # Summed, not painted one over the other: texels on a border that two squares of ink share
     # would keep some paper, and borders would move towards the square that was painted last.
     inked = np.zeros((h, w), np.float32)
@@ -92,8 +93,7 @@ def _board_drawing(size_mm: tuple[float, float], scale: float) -> Image:
         cols, over = _covered(w, (left + x) * scale + w / 2, (left + x + side) * scale + w / 2)
         rows, under = _covered(h, h / 2 - (top - y) * scale, h / 2 - (top - y - side) * scale)
         inked[rows, cols] += under[:, None] * over
-    drawing[..., :3] += inked[..., None] * np.float32(_INK - _PAPER)
-    return drawing
+    return np.asarray(drawing[..., 0] + inked * np.float32(_INK - _PAPER))
 
 
 def _fill(

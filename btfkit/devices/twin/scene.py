@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, final
 
 import cv2
@@ -22,10 +23,13 @@ from btfkit.relief.trace import geometry
 Image = NDArray[np.float32]
 # Rays a side of a pixel, by default.
 GRID = 2
+# Places a side of each ray's part of a pixel at which plate and sample are looked at: borders and
+# threads are finer.
+_FINER = 2
 # Shading of the plate is smooth: it is worked out every fourth pixel or so, and read between.
 _SHADING = 2.0 / 640
 _DARKEST_COSINE = 1e-3
-_DRAWING = 0.75
+_DRAWING, _FINEST = 0.75, 16.0
 
 
 @final
@@ -54,8 +58,8 @@ class Scene:
         self._truth = truth
         self._relief = geometry(relief)
         self._size_mm = (layout.SAMPLE_MM, layout.SAMPLE_MM / relief.aspect)
-        # A little coarser than the rays that read it, so that they miss no part of a border.
-        fine = _DRAWING * grid * size[1] / layout.SEEN_MM
+        # A little coarser than what reads it, so that no part of a border is missed.
+        fine = min(_DRAWING * grid * _FINER * size[1] / layout.SEEN_MM, _FINEST)
         self._plate = Plate(nominal["target"], truth, fine)
         self._spheres = Spheres(truth.spheres)
         self._lamp_mm = imperfections.of("lamp-size", layout.LAMP_RADIUS_MM)
@@ -69,7 +73,7 @@ class Scene:
         board = self._truth.board
         plate_xy = self._plane(placed, board.turn, board.shift)
         shading = self._shading(placed)
-        fine = self._on_plate(plate_xy, shading)
+        fine = self._on_plate(plate_xy, shading, around=_FINER)
         self._add_sample(fine, flat, placed)
         for rows, cols, hit, ray in self._spheres.seen(lens, placed, self._grid):
             if not hit.any():
@@ -117,13 +121,19 @@ class Scene:
         angular = a + b * (cosine_l + cosine_v) + c * cosine_l * cosine_v
         return np.stack([lit, lit * angular], axis=-1).astype(np.float32)
 
-    def _on_plate(self, where: Image, shading: Image) -> Image:
-        """(H, W, 3) pi x radiance of the plate at (H, W, 2) x and y."""
+    def _on_plate(self, where: Image, shading: Image, *, around: int = 1) -> Image:
+        """(H, W, 3) pi x radiance of the plate at (H, W, 2) x and y, of `around`^2 places each."""
         width, height = self._plate.size_mm
         col = (where[..., 0] + np.float32(width / 2)) * np.float32(self._per_mm) - np.float32(0.5)
         row = (np.float32(height / 2) - where[..., 1]) * np.float32(self._per_mm) - np.float32(0.5)
         lit = cv2.remap(shading, col, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        drawn = self._plate.at(where)
+        if around == 1:
+            drawn = self._plate.at(where)
+        else:
+            drawn = np.zeros((*where.shape[:2], 4), np.float32)
+            for step in _parts(where, around):
+                drawn += self._plate.at(where + step)
+            drawn /= around**2
         light = lit[..., 0] + drawn[..., 3] * (lit[..., 1] - lit[..., 0])
         return np.asarray(drawn[..., :3] * light[..., None])
 
@@ -144,9 +154,17 @@ class Scene:
         inside = np.asarray((np.abs(where) < half).all(-1))
         if not inside.any():
             return
-        xy = where[inside]
-        points = np.column_stack([xy, np.zeros(len(xy), np.float32)])
         lamp = self._lamp_points(placed, inside)
+        total = np.zeros((int(inside.sum()), 3), np.float32)
+        for step in _parts(where, _FINER):
+            xy = np.clip((where + step)[inside], -half, half)
+            total += self._traced(xy, lamp, placed)
+        fine[inside] = total / _FINER**2
+
+    def _traced(self, xy: Image, lamp: Image, placed: Placed) -> Image:
+        """(b, 3) pi x radiance of the sample at (b, 2) mm under (b, 3) points of the lamp."""
+        half = np.array([self._size_mm[0] / 2, self._size_mm[1] / 2], np.float32)
+        points = np.column_stack([xy, np.zeros(len(xy), np.float32)])
         to_lamp = lamp - points
         to_camera = placed.camera.astype(np.float32) - points
         distance2 = (to_lamp * to_lamp).sum(-1)
@@ -163,7 +181,7 @@ class Scene:
         irradiance = np.float32(layout.LAMP_MM**2) / distance2
         # Below its horizon the sample's plane hides the lamp.
         irradiance = np.where(light[:, 2] > 0, irradiance, 0)
-        fine[inside] = traced.rgb * irradiance[:, None]
+        return np.asarray(traced.rgb * irradiance[:, None])
 
     def _lamp_points(self, placed: Placed, inside: NDArray[np.bool_]) -> Image:
         """A point of the lamp's disc for each ray: the rays of a pixel share the disc out."""
@@ -183,3 +201,16 @@ class Scene:
         middle = where[grid // 2 :: grid, grid // 2 :: grid]
         points = middle @ placed.rotation[2, :2].astype(np.float32)
         return np.asarray(points - np.float32(placed.rotation[2] @ placed.camera), np.float32)
+
+
+def _parts(where: Image, around: int) -> Iterator[Image]:
+    """(H, W, 2) ways from each ray's place to the middles of the parts of its share of a pixel."""
+    # A ray's neighbour tells how the plane runs; half a ray on it runs alike.
+    down, across = np.empty_like(where), np.empty_like(where)
+    np.subtract(where[1:], where[:-1], out=down[:-1])
+    np.subtract(where[:, 1:], where[:, :-1], out=across[:, :-1])
+    down[-1], across[:, -1] = down[-2], across[:, -2]
+    steps = (np.arange(around, dtype=np.float32) + np.float32(0.5)) / around - np.float32(0.5)
+    for row in steps:
+        for col in steps:
+            yield row * down + col * across

@@ -76,6 +76,27 @@ def truth(folder: Path) -> BTF:
     )
 
 
+def blurred(fine: Array, blur: NDArray[np.floating]) -> Array:
+    """A texture of the truth at half the resolution, under the blur that another texture states.
+
+    Args:
+        fine: (2h, 2w, c) a texture of the truth.
+        blur: (3,) covariance in texels^2 of the result (uu, uv, vv), at least that of a fine texel.
+
+    Returns:
+        (h, w, c); within some texels of the rim the sample is taken to be mirrored.
+    """
+    h, w, c = fine.shape
+    # Beside what is asked: the tracer's own half texel, and the mean of two by two.
+    add = 4 * np.asarray(blur, float) - [0.5, 0, 0.5]
+    y, x = 2 * np.pi * np.fft.fftfreq(2 * h)[:, None], 2 * np.pi * np.fft.fftfreq(2 * w)
+    kernel = np.exp(-0.5 * (add[0] * x**2 + 2 * add[1] * x * y + add[2] * y**2))
+    wide = np.pad(fine.astype(float), ((h // 2, h // 2), (w // 2, w // 2), (0, 0)), mode="reflect")
+    spread = np.fft.ifft2(np.fft.fft2(wide, axes=(0, 1)) * kernel[..., None], axes=(0, 1)).real
+    inner = spread[h // 2 : h // 2 + h, w // 2 : w // 2 + w]
+    return inner.reshape(h // 2, 2, w // 2, 2, c).mean((1, 3)).astype(np.float32)
+
+
 @final
 class NearTextures(Textures):
     """Textures of a relief under a near lamp and a near camera.

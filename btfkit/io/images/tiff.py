@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import math
 import re
-import struct
-from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +15,10 @@ from btfkit.errors import FormatError
 from btfkit.io.images import icc
 from btfkit.io.images.header import Header
 from btfkit.io.images.profiles import D65, Chromaticities, Declared, from_primaries
+from btfkit.tifftags import Directory, below, chain_of
 
 _WIDTH, _HEIGHT, _BITS, _PHOTOMETRIC, _DESCRIPTION = 256, 257, 258, 262, 270
-_ORIENTATION, _SAMPLES, _EXTRA, _FORMAT, _SUBDIRECTORIES = 274, 277, 338, 339, 330
+_ORIENTATION, _SAMPLES, _EXTRA, _FORMAT = 274, 277, 338, 339
 _SUBFILE, _OLD_SUBFILE, _ICC, _DEPTH, _DNG = 254, 255, 34675, 32997, 50706
 _WHITE, _PRIMARIES, _COLOUR_MAP, _TILE_WIDTH = 318, 319, 320, 322
 _REDUCED_OR_MASK = 1 | 4
@@ -33,80 +32,14 @@ _OTHERS = {
 _NOT_READ = {
     291: "a grey response curve", 301: "a transfer function", 342: "a transfer range",
 }  # fmt: skip
-_FORMS = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "s", 8: "h", 9: "i", 10: "ii",
-          11: "f", 12: "d", 13: "I", 16: "Q", 17: "q", 18: "Q"}  # fmt: skip
 _CODES, _SIGNED, _FLOATS = 1, 2, 3
-_MOST_DIRECTORIES, _MOST_ENTRIES, _MOST_VALUE = 4096, 4096, 1 << 24
 _SHAPE = re.compile(rb'^\{"shape": \[([\d, ]{1,200})\]')
 _IMAGEJ = re.compile(rb"^ImageJ=.*?^images=(\d{1,9})$", re.MULTILINE | re.DOTALL)
 
 
-@final
-class Directory:
-    """One directory of a TIFF; values are unpacked when they are asked for."""
-
-    def __init__(self, data: bytes, order: str, big: bool, at: int) -> None:
-        self._data, self._order, self._big = data, order, big
-        count, entry, word = ("Q", 20, "Q") if big else ("H", 12, "I")
-        (entries,) = struct.unpack_from(order + count, data, at)
-        start = at + struct.calcsize(order + count)
-        self._at: dict[int, int] = {}
-        for i in range(min(entries, _MOST_ENTRIES)):
-            (tag,) = struct.unpack_from(order + "H", data, start + entry * i)
-            self._at.setdefault(tag, start + entry * i)
-        try:
-            (self.next,) = struct.unpack_from(order + word, data, start + entry * entries)
-        except struct.error:
-            self.next = 0
-
-    def __contains__(self, tag: int) -> bool:
-        return tag in self._at
-
-    def values(self, tag: int) -> tuple[Any, ...]:
-        """The values of a tag; empty without it. Raises struct.error, ValueError or KeyError."""
-        if tag not in self._at:
-            return ()
-        word, where = ("Q", 12) if self._big else ("I", 8)
-        at = self._at[tag]
-        kind, count = struct.unpack_from(self._order + "H" + word, self._data, at + 2)
-        form = _FORMS[kind]
-        if count > _MOST_VALUE:
-            raise ValueError("absurdly long")
-        form = self._order + (f"{count}s" if form == "s" else form * count if len(form) > 1
-                              else f"{count}{form}")  # fmt: skip
-        if struct.calcsize(form) > (8 if self._big else 4):
-            (begin,) = struct.unpack_from(self._order + word, self._data, at + where)
-        else:
-            begin = at + where
-        return struct.unpack_from(form, self._data, begin)
-
-    def number(self, tag: int, default: int) -> int:
-        """The first value of a tag."""
-        values = self.values(tag)
-        return int(values[0]) if values else default
-
-    def patched(self, tag: int, value: int) -> bytes:
-        """The file with another value of a tag that holds one SHORT."""
-        at = self._at[tag] + (12 if self._big else 8)
-        word = struct.pack(self._order + "H", value)
-        return self._data[:at] + word + self._data[at + 2 :]
-
-    def fractions(self, tag: int) -> list[float]:
-        """Values of a tag of rationals. Raises ValueError where one is none."""
-        pairs = self.values(tag)
-        if not all(pairs[1::2]):
-            raise ValueError("divided by zero")
-        return [a / b for a, b in zip(pairs[::2], pairs[1::2], strict=True)]
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(h, w)."""
-        return int(self.values(_HEIGHT)[0]), int(self.values(_WIDTH)[0])
-
-
 def size(data: bytes) -> tuple[int, int]:
     """(h, w) of the largest picture. Raises struct.error or ValueError where it is damaged."""
-    sizes = [d.size for d in _chain(data) if _WIDTH in d and _HEIGHT in d]
+    sizes = [d.size for d in chain_of(data) if _WIDTH in d and _HEIGHT in d]
     return max(sizes, key=math.prod)
 
 
@@ -116,7 +49,7 @@ def describe(name: str, data: bytes) -> Header:
     Raises:
         FormatError: a camera's RAW file, several pictures, or samples that are not understood.
     """
-    chain = _chain(data)
+    chain = chain_of(data)
     page = _photograph(name, data, chain)
     directory = chain[page]
     h, w = directory.size
@@ -141,7 +74,7 @@ def palette(data: bytes, page: int) -> tuple[bytes, NDArray[np.uint16]] | None:
 
     Libraries cut the colours to 8 bits.
     """
-    directory = _chain(data)[page]
+    directory = chain_of(data)[page]
     if directory.number(_PHOTOMETRIC, -1) != _PALETTE:
         return None
     colours = np.array(directory.values(_COLOUR_MAP), np.uint16).reshape(3, -1).T
@@ -153,37 +86,13 @@ def palette(data: bytes, page: int) -> tuple[bytes, NDArray[np.uint16]] | None:
 
 def inverted(data: bytes, page: int) -> bool:
     """Whether 0 is white."""
-    return _chain(data)[page].number(_PHOTOMETRIC, _GREY) == _GREY_INVERTED
-
-
-def _chain(data: bytes) -> list[Directory]:
-    """The directories, in their order. Raises struct.error or ValueError where damaged."""
-    order = "<" if data[:2] == b"II" else ">"
-    magic = struct.unpack_from(order + "H", data, 2)[0]
-    if magic not in (42, 43):
-        raise ValueError("no TIFF")
-    big = magic == 43
-    (at,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)
-    found: list[Directory] = []
-    seen: set[int] = set()
-    while at and at not in seen and len(found) < _MOST_DIRECTORIES:
-        seen.add(at)
-        found.append(Directory(data, order, big, at))
-        at = found[-1].next
-    return found
-
-
-def _below(data: bytes, directory: Directory) -> list[Directory]:
-    return [
-        Directory(data, directory._order, directory._big, at)
-        for at in directory.values(_SUBDIRECTORIES)[:_MOST_DIRECTORIES]
-    ]
+    return chain_of(data)[page].number(_PHOTOMETRIC, _GREY) == _GREY_INVERTED
 
 
 def _photograph(name: str, data: bytes, chain: list[Directory]) -> int:
     """The one picture that is neither a preview nor a mask."""
-    below = [each for directory in chain for each in _below(data, directory)]
-    raw = [d for d in (*chain, *below) if d.number(_PHOTOMETRIC, -1) in _RAW]
+    inner = [each for directory in chain for each in below(data, directory)]
+    raw = [d for d in (*chain, *inner) if d.number(_PHOTOMETRIC, -1) in _RAW]
     if raw or any(_DNG in d for d in chain) or data[8:10] == b"CR":
         what = _RAW[raw[0].number(_PHOTOMETRIC, -1)] if raw else "a RAW file of a camera"
         raise FormatError(
@@ -193,10 +102,10 @@ def _photograph(name: str, data: bytes, chain: list[Directory]) -> int:
     full = [page for page, directory in enumerate(chain) if not _secondary(directory)]
     if not full and len(chain) == 1:
         full = [0]
-    largest = max((math.prod(d.size) for d in below if not _secondary(d)), default=0)
+    largest = max((math.prod(d.size) for d in inner if not _secondary(d)), default=0)
     if len(full) == 1 and largest <= math.prod(chain[full[0]].size):
         return full[0]
-    listing = [f"{i}: {h} x {w}" for i, (h, w) in enumerate(d.size for d in (*chain, *below))]
+    listing = [f"{i}: {h} x {w}" for i, (h, w) in enumerate(d.size for d in (*chain, *inner))]
     raise FormatError(
         name,
         f"holds {len(listing)} pictures ({', '.join(listing[:8])}); expected one",
