@@ -485,7 +485,7 @@ EXTREMES = [
     {"depth": "network", "offset_activation": "sine"}, {"depth": "network", "frames": "0"},
     {"inputs": "half"}, {"inputs": "xy", "activation": "sine"}, {"output": "mask"}, {"output": "relu"},
     {"loss": "absolute"}, {"batch": "1"}, {"batch": "100000"}, {"rate": "0", "texture_rate": "0"},
-    {"rate": "1", "texture_rate": "1"}, {"beta2": "0"}, {"omega": "1000"}, {"smooth": "0"},
+    {"rate": "1", "texture_rate": "1"}, {"beta2": "0"}, {"omega": "1000", "activation": "sine"}, {"smooth": "0"},
     {"smooth": "8"}, {"frames": "1", "features": "5"},
     {"precision": "int8"}, {"precision": "float32"}, {"pool_mb": "1"}, {"networks": "bfloat16"},
 ]  # fmt: skip

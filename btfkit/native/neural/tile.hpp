@@ -10,9 +10,11 @@ struct Tile {
     Features offset_features, features[kMaxBanks];
     Levels levels;
     // u v du_view dv_view du_light dv_light depth, of heights the ray, the crossing and its share
-    // of the depth, the gradient of the depth; and channels of one bank
+    // of the depth, the gradient of the depth, what curvature makes of a ray (the curvature a unit
+    // of heights, the opacity, and what scatter_heights takes); and channels of one bank
     Rows in, slopes;
     Surface surface{};
+    bool bent = false, train_ = false;  // whether the batch has curvatures; whether it is learnt from
     alignas(64) float direction[kInputs][kTile];
     alignas(64) float position[2][kTile];
     alignas(64) float gather[kTile][kChannels];
@@ -21,11 +23,12 @@ struct Tile {
     int ahead = 0, now = 0;
     bool fetched = false;
     Feed feed;
-    enum { kU, kV, kHu, kHv, kLu, kLv, kDepth, kRayU, kRayV, kLift, kCross, kSlope, kInRows };
+    enum { kU, kV, kHu, kHv, kLu, kLv, kDepth, kRayU, kRayV, kLift, kCross, kSlope,
+           kBend, kOpaque, kClear, kLeast, kInRows };
 
     NEUMIP_TARGET Tile(const Plan& p, const float* weights, const float* t, const Batch& b,
                        bool train)
-        : plan(p), texels(t) {
+        : plan(p), texels(t), train_(train) {
         surface = {t, float(p.heights.w), float(p.heights.h), b.top, b.bottom, p.wrap};
         decoder.pack(p.decoder, weights, train, p.half, p.pairs && L == 16);
         decoder_trace.reset(p.decoder, train);
@@ -103,14 +106,62 @@ struct Tile {
         }
     }
 
+    NEUMIP_TARGET void set_curvature(const float* curvature, int valid, int n) {
+        if (!plan.curved) return;
+        bent = curvature != nullptr;
+        std::fill(in[kOpaque], in[kOpaque] + n, 1.f);
+        if (!bent) {
+            std::memset(direction[kCurvature], 0, sizeof direction[kCurvature]);
+            return;
+        }
+        for (int i = 0; i < n; ++i) in[kBend][i] = curvature[i < valid ? i : valid - 1];
+        for (int i = 0; i < n; i += L) {
+            const F k = load(in[kBend] + i), size = k < all(0.f) ? -k : k;
+            store(direction[kCurvature] + i, k / (size + kCurvatureUnit));
+            store(in[kBend] + i, k * plan.depth_scale);
+        }
+    }
+
     // Ray depths where the view rays of queries from..from+n meet the heights.
     MEMBER void meet(int from, int n) {
         for (int i = from; i < from + n; i += L) {
-            const F z = surface.crossing(load(in[kU] + i), load(in[kV] + i), load(in[kRayU] + i),
-                                         load(in[kRayV] + i));
-            store(in[kCross] + i, z);
-            store(in[kDepth] + i, z * load(in[kLift] + i));
+            const I curved = bent ? load(in[kBend] + i) != all(0.f) : I{};
+            if (any_of(~curved)) {
+                const F z = surface.crossing(load(in[kU] + i), load(in[kV] + i),
+                                             load(in[kRayU] + i), load(in[kRayV] + i));
+                store(in[kCross] + i, z);
+                store(in[kDepth] + i, z * load(in[kLift] + i));
+                if (bent) {
+                    store(in[kClear] + i, all(1.f));
+                    store(in[kLeast] + i, all(kFlattest));
+                }
+            }
+            if (any_of(curved)) meet_curved(i, curved);
         }
+    }
+
+    // The same of L queries on a curved surface; lanes outside `curved` stay as they are.
+    MEMBER void meet_curved(int i, I curved) {
+        auto put = [&](int row, F x) NEUMIP_TARGET {
+            store(in[row] + i, select(curved, x, load(in[row] + i)));
+        };
+        const F x = load(direction[kVx] + i), y = load(direction[kVy] + i);
+        const Ray r = ray_of(surface, x, y, load(direction[kVz] + i), load(in[kBend] + i));
+        const F part = -plan.depth_scale / larger(root(x * x + y * y), all(kLeastSine));
+        put(kRayU, x * part);
+        put(kRayV, y * part * -plan.aspect);
+        I opaque;
+        const F way = meet_bent(surface, r, load(in[kU] + i), load(in[kV] + i),
+                                load(in[kRayU] + i), load(in[kRayV] + i), opaque);
+        put(kCross, way);
+        put(kDepth, -way * r.share);
+        put(kOpaque, select(opaque, all(1.f), all(0.f)));
+        if (!train_) return;
+        // Their way runs against that of the plane's rays, which rise.
+        const F fall = r.falling(way);
+        put(kClear, fall);
+        put(kLeast, kFlattest * larger(fall, all(kSteepest)));
+        put(kLift, r.share);
     }
 
     NEUMIP_TARGET void set_light(const float* light, int valid, int n, bool same) {
@@ -268,8 +319,16 @@ struct Tile {
         const int n = padded(valid);
         set_position(b.uv + 2 * at, b.footprint ? b.footprint + at : nullptr, valid, n);
         set_view(b.view + 3 * at, valid, n);
+        set_curvature(b.curvature ? b.curvature + at : nullptr, valid, n);
         find_features<false>(*this, b, at, valid, n);
         fetched = false;
+    }
+
+    // Whether any ray of the tile meets the heights.
+    bool seen(int valid) const {
+        if (!bent) return true;
+        const float* opaque = in.base + size_t(kOpaque) * kStride;
+        return std::any_of(opaque, opaque + valid, [](float x) { return x > 0; });
     }
 
     // Writes (valid, outputs) reflectance; stage_one has run for these queries.
@@ -298,7 +357,8 @@ struct Tile {
             for (int c = 0; c < outputs; ++c)
                 for (int i = 0; i < n; i += L) {
                     const F y = smaller(larger(answer(c, i), all(0.f)), all(kMostLog));
-                    store(z[c] + i, exp_of(y) - 1.f);
+                    const F value = exp_of(y) - 1.f;
+                    store(z[c] + i, bent ? value * load(in[kOpaque] + i) : value);
                 }
         if (outputs == 3) {
             const float *r = z[0], *g = z[1], *bl = z[2];
