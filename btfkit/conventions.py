@@ -19,6 +19,8 @@ CURVED_LOOKS = 16
 CURVED_FINER = 2.0
 # Curvature x depth of the heights at most: beyond 1 they would reach the axis of curvature.
 MOST_BEND = 0.9
+# Lowest cosine of a view where its ray meets curved heights, as layers take it.
+LOWEST_SEEN = 0.02
 # What a curvature is compared with, as an input, 1 / tile width.
 CURVATURE_UNIT = 16.0
 # Lowest cosine of a view ray through heights: 84 degrees.
@@ -81,6 +83,7 @@ def header() -> str:
         "kMostLog": MOST_LOG,
         "kLevelsUnit": LEVELS_UNIT,
         "kMostBend": MOST_BEND,
+        "kLowestSeen": LOWEST_SEEN,
         "kCurvedFiner": CURVED_FINER,
         "kCurvatureUnit": CURVATURE_UNIT,
     }

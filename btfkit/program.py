@@ -9,7 +9,8 @@ arrays, no code. In order, for a query (uv, light, view, footprint, curvature):
    `light` part move along the light, too.
 2. textures: bilinear between texel centres, between levels by log2(2 x footprint) - shift.
 3. frames: three features of the first texture each, as vectors.
-4. inputs: one number a name, in order. 5. layers. 6. heads and output: to reflectance, opacity.
+4. inputs: one number a name, in order; on curved heights light and view are in the frame where
+   the ray meets them. 5. layers. 6. heads and output: to reflectance, opacity.
 """
 
 from __future__ import annotations
@@ -145,8 +146,8 @@ class Program:
         scaling: texture of (mean, deviation) that the log head is scaled by; None without.
         leveled: whether footprints count; where they do not, each query is one of 0.5.
         rounded: whether layers but the first multiply numbers rounded to bfloat16.
-        full_sphere: whether lights below the horizon have an answer other than 0; on the plane
-            they have none.
+        full_sphere: whether lights below the horizon may have an answer other than 0: those above
+            it where the ray meets curved heights have.
 
     Raises:
         ValueError: parts that do not fit each other, by name.

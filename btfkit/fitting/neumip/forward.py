@@ -17,6 +17,7 @@ from btfkit.conventions import (
     LEVELS_UNIT,
     LOOKS,
     LOWEST_COSINE,
+    LOWEST_SEEN,
     STEEPEST,
     displacement,
 )
@@ -54,12 +55,15 @@ def forward(
         depth = run(network, offset_weights, [psi], known) * layout.depth_scale
     elif layout.heights is not None:
         depth = ray_depth(layout, layout.surface(texels), uv, view)
-        if layout.curved and curvature is not None:
-            bent = bent_depth(layout, layout.surface(texels), uv, view, curvature)
-            depth = torch.where((curvature != 0)[:, None], bent, depth)
+    away, toward = step(light, layout), step(view, layout)
+    if layout.curved and curvature is not None:
+        on_curve, turn = bent_depth(layout, layout.surface(texels), uv, view, curvature)
+        depth = torch.where((curvature != 0)[:, None], on_curve, depth)
+        light, view = turned(light, view, torch.where(curvature != 0, turn, 0.0))
+        known = directions(light, view, footprint, curvature)
     features = []
     for bank, levels in zip(layout.banks, textures, strict=True):
-        move = bank.view * step(view, layout) - bank.light * step(light, layout)
+        move = bank.view * toward - bank.light * away
         features.append(_between_levels(bank, levels, uv + depth * move, known, wrap=layout.wrap))
     half = torch.stack([known[name] for name in ("hx", "hy", "hz")], dim=1)
     for k in range(layout.frames):
@@ -91,8 +95,11 @@ def ray_depth(layout: Layout, surface: Tensor, uv: Tensor, view: Tensor) -> Tens
 
 def bent_depth(
     layout: Layout, surface: Tensor, uv: Tensor, view: Tensor, curvature: Tensor
-) -> Tensor:
-    """The same on a curved surface; `native.neural.bent` finds where, without a gradient."""
+) -> tuple[Tensor, Tensor]:
+    """The same on a curved surface, and the turn (b,) of the ray, which has no gradient.
+
+    `native.neural.bent` finds where the ray ends.
+    """
     found = Heights(surface.detach().numpy(), layout.depth_scale, True)
     parts = [part.detach().numpy() for part in (view, curvature)]
     rays = bent.rays_of(found, parts[0], parts[1], layout.aspect)
@@ -108,19 +115,30 @@ def bent_depth(
     moved = rays.share / bent.clearance(rays, met.way, climb) * layout.depth_scale
     height = bilinear(surface[..., None], here.detach(), wrap=layout.wrap)
     rise = (height - height.detach()) * torch.from_numpy(moved * met.opacity)[:, None]
-    return torch.from_numpy(met.depth)[:, None] + rise
+    return torch.from_numpy(met.depth)[:, None] + rise, torch.from_numpy(met.turn)
 
 
-def passing(layout: Layout, texels: Tensor, batch: Batch) -> NDArray[np.bool_]:
-    """(b,) queries of a batch whose view rays pass the heights."""
-    none = np.zeros(len(batch), bool)
-    if not layout.curved or batch.curvature is None:
-        return none
+def turned(light: Tensor, view: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
+    """Directions as layers take them where rays end; see `bent.turned`."""
+    seen, angle = view.numpy(), turn.numpy()
+    lit, there = (bent.turned(each.numpy(), seen, angle) for each in (light, view))
+    there[:, 2] = np.where(angle == 0, there[:, 2], np.maximum(there[:, 2], LOWEST_SEEN))
+    return torch.from_numpy(lit), torch.from_numpy(there)
+
+
+def dark(layout: Layout, texels: Tensor, batch: Batch) -> NDArray[np.bool_]:
+    """(b,) queries of a batch that see nothing of curved heights, or nothing that is lit."""
+    if not layout.curved:
+        return np.zeros(len(batch), bool)
+    if batch.curvature is None:
+        return batch.light[:, 2] <= 0
     found = Heights(layout.surface(texels).detach().numpy(), layout.depth_scale, True)
     met = bent.meet(
         found, batch.uv, batch.view, batch.curvature, aspect=layout.aspect, wrap=layout.wrap
     )
-    return (met.opacity == 0) & (batch.curvature != 0)
+    curved = batch.curvature != 0
+    light = bent.turned(batch.light, batch.view, np.where(curved, met.turn, 0))
+    return (curved & (met.opacity == 0)) | (light[:, 2] <= 0)
 
 
 def _crossing(surface: Tensor, uv: Tensor, along: Tensor, *, wrap: bool) -> Tensor:
@@ -274,9 +292,9 @@ def loss_on_batch(
     raw = forward(layout, weights, texels, *tensors(batch), bend)
     answer = log_answer(layout, raw)
     weight = None if batch.weight is None else torch.from_numpy(batch.weight)
-    passed = passing(layout, texels, batch)
-    if passed.any():
-        kept = torch.from_numpy(~passed).to(answer.dtype)
+    unseen = dark(layout, texels, batch)
+    if unseen.any():
+        kept = torch.from_numpy(~unseen).to(answer.dtype)
         weight = kept if weight is None else weight * kept
     return loss_of(layout, answer, torch.from_numpy(batch.target), weight, kind)
 

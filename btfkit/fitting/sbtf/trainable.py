@@ -35,9 +35,7 @@ class SBTF(Marching[Settings]):
     def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:
         s, source = self.settings, self._data
         bend = None if isinstance(source, BTF) else source.curvature
-        curved = np.empty(0, np.intp) if bend is None else np.flatnonzero(bend)
-        told = ("curvature",) if s.curvature and len(curved) else ()
-        below = bool(len(curved) and (source.light[curved, 2] < 0).any())
+        told = ("curvature",) if s.curvature and bend is not None and bend.any() else ()
         return NeuMIPSpec(
             size,
             levels,
@@ -47,7 +45,6 @@ class SBTF(Marching[Settings]):
             frames=min(s.frames, s.features // 3),
             heights=True,
             curved=True,
-            sphere=below,
             hidden=(s.width,) * 3,
             activation=s.activation,  # type: ignore[arg-type]
             directions=(*INPUTS[s.inputs], *told),

@@ -30,7 +30,6 @@ class NeuMIPSpec:
         heights: whether the ray depth is where the view ray meets a texture of heights; then
             there is no offset network, whatever `offset` says.
         curved: whether curvature bends the rays through the heights.
-        sphere: whether lights below the horizon have an answer on curved surfaces.
         frames: vectors among the pyramid's channels, three each, whose products with the half
             vector and the light the decoder takes too: 0, 1 or 2.
         hidden, offset_hidden: widths of the hidden layers.
@@ -65,7 +64,6 @@ class NeuMIPSpec:
     frames: int = 0
     networks: Networks = "float32"
     curved: bool = False
-    sphere: bool = False
 
     def layout(self, header: Header) -> Layout:
         """The model as its kernels see it."""
@@ -107,5 +105,4 @@ class NeuMIPSpec:
             depth_scale=self.depth_scale,
             wrap=header.wrap == "wrap",
             curved=self.curved,
-            sphere=self.sphere,
         )

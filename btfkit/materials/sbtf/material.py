@@ -1,7 +1,9 @@
 """SBTF as it is used: rays that curvature bends meet a texture of heights, or pass it.
 
 What NeuMIP answers on the plane is answered on curved surfaces: opacity and the place that is seen
-come from geometry, exactly on a cylinder; layers are told the curvature where it was learnt.
+come from geometry, exactly on a cylinder. Layers take light and view in the frame where the ray
+meets the heights, so that what was learnt on the plane is right there, and the curvature where it
+was learnt.
 
 Source: Kuznetsov et al., "Rendering Neural Materials on Curved Surfaces", 2022, whose networks of
 opacity and offset the march replaces.
@@ -59,7 +61,6 @@ class SBTF(NeuMIPMaterial):
         else:
             opacity = np.empty(len(query.uv), np.float32)
             answer = self._kernel.evaluate(self.flat, self.texels, *parts, opacity=opacity)
-        answer[self._unlit(query.light[:, 2] <= 0, bend)] = 0
         return answer.astype(np.float32, copy=False), opacity.astype(np.float32, copy=False)
 
     def _answer_lights(self, query: Query) -> tuple[Array, Array | None]:
@@ -67,14 +68,7 @@ class SBTF(NeuMIPMaterial):
         bend, opacity = self._bend(query), np.empty(len(query.uv), np.float32)
         parts = (query.uv, query.light, query.view, self._footprint(query), bend)
         answer = self._kernel.evaluate_lights(self.flat, self.texels, *parts, opacity=opacity)
-        dark = self._unlit(np.ones(len(query.uv), bool), bend)
-        for below in np.flatnonzero(query.light[:, 2] <= 0):
-            answer[below, dark] = 0
         return answer, opacity
-
-    def _unlit(self, below: NDArray[np.bool_], bend: Array | None) -> NDArray[np.bool_]:
-        """(b,) of queries with light from below the horizon, those that have no answer."""
-        return below if bend is None or not self.spec.sphere else below & (bend == 0)
 
     def _bend(self, query: Query) -> Array | None:
         """Curvature (b,); None, which the plane's rays take, where there is none."""

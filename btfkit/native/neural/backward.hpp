@@ -8,8 +8,8 @@ NEUMIP_TARGET inline void Tile::judge(const Batch& b, int64_t at, int valid, int
     float* target = slopes[0];
     float* weight = slopes[1];
     for (int i = 0; i < n; ++i) weight[i] = i < valid ? (b.weight ? b.weight[at + i] : 1.f) : 0.f;
-    if (bent)  // what a ray that passes would have seen teaches nothing
-        for (int i = 0; i < n; ++i) weight[i] *= in[kOpaque][i];
+    if (plan.curved)  // what would be seen of what is not seen, or not lit, teaches nothing
+        for (int i = 0; i < n; i += L) store(weight + i, load(weight + i) * seen_and_lit(i));
     for (int k = 0; k < c; ++k) {
         const float* from = b.target + at * c + k;
         for (int i = 0; i < valid; ++i) target[i] = from[int64_t(i) * c];
@@ -49,8 +49,8 @@ NEUMIP_TARGET inline void Tile::train(const Batch& b, int64_t at, int valid, int
     set_position(b.uv + 2 * at, b.footprint ? b.footprint + at : nullptr, valid, n);
     set_view(b.view + 3 * at, valid, n);
     set_curvature(b.curvature ? b.curvature + at : nullptr, valid, n);
-    set_light(b.light + 3 * at, valid, n, false);
     find_features<true>(*this, b, at, valid, n);
+    set_light(b.light + 3 * at, valid, n, false);
     if (plan.needs_light())
         for (int half = 0; half < 2; ++half)
             look_up_features(*this, half_from(half), half_size(half, n), half, valid, true);

@@ -71,11 +71,13 @@ class Crossing(NamedTuple):
         depth: (b,) ray depth, tile widths, as `plain.depths`.
         opacity: (b,) 1 where they do, 0 where they pass; there the depth is that of the end.
         way: (b,) over the surface, units of heights.
+        turn: (b,) angle at the axis between the entry and there, radians.
     """
 
     depth: Array
     opacity: Array
     way: Array
+    turn: Array
 
 
 def meet(
@@ -124,7 +126,7 @@ def meet(
     way = met(high, low, gap, under)
     way = np.where(opaque, way, rays.stop)
     depth = -way * rays.share * np.asarray(found.scale, way.dtype)
-    return Crossing(depth, opaque.astype(way.dtype), way)
+    return Crossing(depth, opaque.astype(way.dtype), way, rays.bend * way)
 
 
 def rays_of(found: Heights, view: Array, curvature: Array, aspect: float) -> Rays:
@@ -179,6 +181,16 @@ def clearance(rays: Rays, way: Array, climb: Array) -> Array:
     """
     fall = falling(rays, way)
     return np.maximum(fall + climb, FLATTEST * np.maximum(fall, STEEPEST))
+
+
+def turned(direction: Array, view: Array, turn: Array) -> Array:
+    """Directions (b, 3) at the entry of views (b, 3), in the frame where the turned ray is."""
+    back = -view[:, :2] / np.maximum(np.hypot(view[:, 0], view[:, 1]), _LEAST_SINE)[:, None]
+    sine, cosine = np.sin(turn), np.cos(turn)
+    along, up = (direction[:, :2] * back).sum(axis=1), direction[:, 2]
+    shift = along * (cosine - 1) - up * sine
+    flat = direction[:, :2] + shift[:, None] * back
+    return np.column_stack([flat, along * sine + up * cosine]).astype(direction.dtype)
 
 
 def softened(curvature: Array) -> Array:

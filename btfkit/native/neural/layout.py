@@ -104,7 +104,6 @@ class Layout:
         heights: (h, w) of a texture of heights, whose first crossing with the view ray gives the
             ray depth in place of the network; None without it.
         curved: whether curvature bends the rays through the heights, which may then pass them.
-        sphere: whether lights below the horizon have an answer on curved surfaces.
         frames: vectors among the first bank's features, three numbers each: the decoder takes
             the products of each with the half vector and with the light, after the features.
         channels: of the answer. output: "log" as it comes, "relu" with negative numbers cut,
@@ -125,7 +124,6 @@ class Layout:
     depth_scale: float = 1.0
     wrap: bool = True
     curved: bool = False
-    sphere: bool = False
 
     def __post_init__(self) -> None:
         if self.offset and self.heights:
@@ -238,7 +236,7 @@ class Layout:
             frames=self.frames,
             leveled=leveled,
             rounded=networks == "bfloat16",
-            full_sphere=self.sphere,
+            full_sphere=self.curved,
         )
 
 

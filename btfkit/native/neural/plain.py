@@ -14,6 +14,7 @@ from btfkit.conventions import (
     LEVELS_UNIT,
     LOOKS,
     LOWEST_COSINE,
+    LOWEST_SEEN,
     MOST_LOG,
     STEEPEST,
     displacement,
@@ -44,16 +45,13 @@ def answer(
         footprint: (b,) texels of the data's grid; None is 0.5 throughout.
         curvature: (b,) 1/tile width; None is the plane.
     """
-    raw, scaled, opacity = _last_layer(program, uv, light, view, footprint, curvature)
+    raw, scaled, (opacity, lit) = _last_layer(program, uv, light, view, footprint, curvature)
     heads = _heads(program, raw)
     if "opacity" in heads:
         opacity = _sigmoid(heads["opacity"][:, 0])
     rgb = _reflectance(program, heads, scaled, light)
     if program.opacity == "march":
-        rgb = rgb * (opacity[:, None] > 0)
-    if program.full_sphere:
-        plane = np.ones(len(uv), bool) if curvature is None else curvature == 0
-        rgb = np.where((plane & (light[:, 2] <= 0))[:, None], 0, rgb)
+        rgb = rgb * ((opacity > 0) & lit)[:, None]
     return rgb, opacity
 
 
@@ -96,22 +94,22 @@ def depths(program: Program, uv: Array, view: Array, curvature: Array | None = N
 
 def marched(
     program: Program, uv: Array, view: Array, curvature: Array | None = None
-) -> tuple[Array, Array]:
-    """Ray depth (b,) as `depths`, and opacity (b,): 0 where a ray passes curved heights."""
+) -> tuple[Array, Array, Array]:
+    """Ray depth (b,) as `depths`, opacity (b,) and turn (b,) as `bent.Crossing` has them."""
     found, dtype = program.depth, program.textures[0].levels[0].dtype
-    opacity = np.ones(len(uv), dtype)
+    opacity, turn = np.ones(len(uv), dtype), np.zeros(len(uv), dtype)
     if found is None:
-        return np.zeros(len(uv), dtype), opacity
+        return np.zeros(len(uv), dtype), opacity, turn
     if not isinstance(found, Heights):
-        return _network_depths(program, found, uv, view), opacity
+        return _network_depths(program, found, uv, view), opacity, turn
     along = ray(view, program.aspect, found.scale)
     met = crossing(found.heights, uv, along, wrap=program.wrap)
     depth = met * lift(view) * found.scale
     if found.curved and curvature is not None and (rows := np.flatnonzero(curvature)).size:
-        depth[rows], opacity[rows], _ = bent.meet(
+        depth[rows], opacity[rows], _, turn[rows] = bent.meet(
             found, uv[rows], view[rows], curvature[rows], aspect=program.aspect, wrap=program.wrap
         )
-    return depth, opacity
+    return depth, opacity, turn
 
 
 def _network_depths(program: Program, found: DepthNetwork, uv: Array, view: Array) -> Array:
@@ -259,16 +257,22 @@ def _last_layer(
     view: Array,
     footprint: Array | None,
     curvature: Array | None,
-) -> tuple[Array, Array | None, Array]:
-    """The last layer's numbers, what the scaling texture says there, and the march's opacity."""
+) -> tuple[Array, Array | None, tuple[Array, Array]]:
+    """The last layer's numbers, what the scaling texture says there, and the march's opacity.
+
+    With the opacity (b,) it says whether light comes from above where the ray ends, (b,).
+    """
+    depth, opacity, turn = marched(program, uv, view, curvature)
+    toward, away = step(view, program.aspect), step(light, program.aspect)
+    if turn.any():
+        light, view = (bent.turned(direction, view, turn) for direction in (light, view))
+        view[:, 2] = np.where(turn == 0, view[:, 2], np.maximum(view[:, 2], LOWEST_SEEN))
     known = _known(light, view, footprint if program.leveled else None, curvature)
-    depth, opacity = marched(program, uv, view, curvature)
     every = [*program.textures, *([program.scaling] if program.scaling else [])]
     values = []
     for texture in every:
         moved = uv
         if program.depth is not None and (texture.view or texture.light):
-            toward, away = step(view, program.aspect), step(light, program.aspect)
             moved = uv + depth[:, None] * (texture.view * toward - texture.light * away)
         values.append(_between_levels(texture, moved, known["level"] * LEVELS_UNIT, program.wrap))
     for texture, found in zip(program.textures, values, strict=False):
@@ -279,7 +283,7 @@ def _last_layer(
         axis = values[0][:, 3 * k : 3 * k + 3]
         known |= {next(names): (axis * direction).sum(axis=1) for direction in (half, light)}
     raw = _run(program.layers, program.inputs, known, rounded=program.rounded)
-    return raw, values[-1] if program.scaling else None, opacity
+    return raw, values[-1] if program.scaling else None, (opacity, light[:, 2] > 0)
 
 
 def _heads(program: Program, raw: Array) -> dict[str, Array]:
