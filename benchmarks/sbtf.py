@@ -94,11 +94,13 @@ def measured(name: str, asked: Asked) -> dict[str, Any]:
 
 
 def fitted(source: Any, model: str, asked: Asked, **settings: Any) -> Material:
+    """A model in as many steps as are asked for."""
     report = fit(source, model=model, steps=asked.steps, holdout=0.02, settings=settings)
     return report.material
 
 
 def depth_of(relief: Relief) -> float:
+    """Depth of a relief under its surface, tile widths."""
     return float(-relief.height.min())
 
 
@@ -110,6 +112,7 @@ def height_error(material: Material, relief: Relief) -> float:
 
 
 def on_cylinders(relief: Relief) -> Band:
+    """Random queries on convex cylinders, lights over the whole sphere."""
     rng = np.random.default_rng(2)
     z, angle = rng.uniform(0.02, 1, ROWS), rng.uniform(0, 2 * np.pi, ROWS)
     flat = np.sqrt(1 - z**2)
@@ -141,6 +144,7 @@ def errors(material: Material, band: Band) -> dict[str, float]:
 
 
 def plane_psnr(material: Material, relief: Relief) -> float:
+    """PSNR on the plane, of queries that no fit has seen."""
     queries = random_queries(relief, 20000, seed=3, samples=4)
     rgb = material.evaluate(queries.uv, queries.light, queries.view).reflectance
     assert queries.rgb is not None
@@ -148,6 +152,7 @@ def plane_psnr(material: Material, relief: Relief) -> float:
 
 
 def torus(material: Material) -> Any:
+    """The picture of a torus, one ray a pixel."""
     scene = Scene(material, shape_of("torus"), LIGHT[None])
     return render(scene, view=VIEW, size=(PICTURE, PICTURE))
 
@@ -200,21 +205,18 @@ def cost(material: Material, query: Query) -> dict[str, float]:
 
 
 def draw(path: Path, materials: list[Material]) -> None:
+    """Pictures of the torus side by side: the tracer's, then each model's."""
     pictures = [torus(material) for material in materials]
-    whole = side_by_side(pictures)
+    whole = pictures[0]._replace(
+        radiance=np.concatenate([p.radiance for p in pictures], axis=1),
+        cover=np.concatenate([p.cover for p in pictures], axis=1),
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     picture.write(whole, path, channels=("R", "G", "B"), exposure=0.7, force=True)
 
 
-def side_by_side(pictures: list[Any]) -> Any:
-    """Pictures side by side."""
-    return pictures[0]._replace(
-        radiance=np.concatenate([p.radiance for p in pictures], axis=1),
-        cover=np.concatenate([p.cover for p in pictures], axis=1),
-    )
-
-
 def main() -> None:
+    """One line of JSON a material."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("materials", nargs="*", default=MATERIALS)
     parser.add_argument("--size", type=int, default=96)
