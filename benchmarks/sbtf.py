@@ -129,11 +129,11 @@ def on_cylinders(relief: Relief) -> Band:
 
 
 def errors(material: Material, band: Band) -> dict[str, float]:
-    """IoU of opacity in the band, and PSNR of what is seen, by where its light comes from."""
+    """IoU of opacity in the band, and PSNR of what both see, by where its light comes from."""
     query = band.query
     bend = query.curvature if material.has_curvature else 0.0
     rgb, opacity = material.evaluate(query.uv, query.light, query.view, 0.5, bend)
-    seen = band.opacity > 0.5
+    seen = (band.opacity > 0.5) & (opacity > 0.5)
     off = np.square(rgb - band.rgb).mean(axis=1)
     above = query.light[:, 2] > 0
     return {
