@@ -13,6 +13,16 @@ LEAK = 0.01
 LOWEST_COSINE = 0.6
 # Looks at most along a view ray through heights.
 LOOKS = 8
+# Looks at most along a view ray that curvature lets leave the heights again.
+CURVED_LOOKS = 16
+# Looks a texel along such a ray; along others there is one.
+CURVED_FINER = 2.0
+# Curvature x depth of the heights at most: beyond 1 they would reach the axis of curvature.
+MOST_BEND = 0.9
+# Lowest cosine of a view where its ray meets curved heights, as layers take it.
+LOWEST_SEEN = 0.02
+# What a curvature is compared with, as an input, 1 / tile width.
+CURVATURE_UNIT = 16.0
 # Lowest cosine of a view ray through heights: 84 degrees.
 STEEPEST = 0.1
 # Where a ray grazes the heights, its crossing moves no faster than 1 / FLATTEST of a height.
@@ -38,7 +48,7 @@ INPUTS: dict[str, str] = {
     "hz": "half vector, z",
     "cos_diff": "cosine between light and half vector",
     "level": "log2(2 x footprint) / 8, 0 or more",
-    "curvature": "curvature along the projected view ray, 1 / tile width",
+    "curvature": "curvature k along the projected view ray, k / (CURVATURE_UNIT + |k|)",
     "lx_disc": "light on the disc, x: azimuth kept, radius 2 / pi x polar angle",
     "ly_disc": "light on the disc, y",
     "vx_disc": "view on the disc, x",
@@ -72,6 +82,10 @@ def header() -> str:
         "kFlattest": FLATTEST,
         "kMostLog": MOST_LOG,
         "kLevelsUnit": LEVELS_UNIT,
+        "kMostBend": MOST_BEND,
+        "kLowestSeen": LOWEST_SEEN,
+        "kCurvedFiner": CURVED_FINER,
+        "kCurvatureUnit": CURVATURE_UNIT,
     }
     inputs = ["k" + "".join(part.title() for part in name.split("_")) for name in KERNEL_INPUTS]
     names = ", ".join(f'"{name}"' for name in KERNEL_INPUTS)
@@ -83,6 +97,7 @@ def header() -> str:
             "namespace conventions {",
             *(f"constexpr float {name} = {float(value)!r}f;" for name, value in numbers.items()),
             f"constexpr int kLooks = {LOOKS};",
+            f"constexpr int kCurvedLooks = {CURVED_LOOKS};",
             f"enum Input {{ {', '.join(inputs)}, kInputs }};",
             f"constexpr const char* kInputNames[] = {{{names}}};",
             "}  // namespace conventions",

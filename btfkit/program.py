@@ -4,11 +4,13 @@ A `Program` is read by whatever evaluates a material without its class: the plai
 (`native.neural.plain`), the kernels, exporters, the page viewer and renderers' plugins. It holds
 arrays, no code. In order, for a query (uv, light, view, footprint, curvature):
 
-1. depth: where the view ray meets the heights, or what the depth network says, times
-   `displacement(view)` moves uv; textures with a `light` part move along the light, too.
+1. depth: where the view ray meets the heights (on a curved surface `native.neural.bent` says
+   where), or what the depth network says, times `displacement(view)` moves uv; textures with a
+   `light` part move along the light, too.
 2. textures: bilinear between texel centres, between levels by log2(2 x footprint) - shift.
 3. frames: three features of the first texture each, as vectors.
-4. inputs: one number a name, in order. 5. layers. 6. heads and output: to reflectance, opacity.
+4. inputs: one number a name, in order; on curved heights light and view are in the frame where
+   the ray meets them. 5. layers. 6. heads and output: to reflectance, opacity.
 """
 
 from __future__ import annotations
@@ -82,7 +84,7 @@ class Heights:
     Attributes:
         heights: (h, w), units of `scale`; bilinear between texel centres.
         scale: tile widths a unit.
-        curved: whether curvature bends the ray.
+        curved: whether curvature bends the ray, which may then pass the heights: opacity 0.
     """
 
     heights: Floats
@@ -144,7 +146,8 @@ class Program:
         scaling: texture of (mean, deviation) that the log head is scaled by; None without.
         leveled: whether footprints count; where they do not, each query is one of 0.5.
         rounded: whether layers but the first multiply numbers rounded to bfloat16.
-        full_sphere: whether lights below the horizon have an answer other than 0.
+        full_sphere: whether lights below the horizon may have an answer other than 0: those above
+            it where the ray meets curved heights have.
 
     Raises:
         ValueError: parts that do not fit each other, by name.

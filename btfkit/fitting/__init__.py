@@ -12,6 +12,7 @@ TRAINED: dict[str, str] = {
     "rainer20": "btfkit.fitting.rainer.trainable:Rainer20",
     "neumip": "btfkit.fitting.neumip.trainable:NeuMIP",
     "neumip-paper": "btfkit.fitting.neumip.paper:NeuMIPPaper",
+    "sbtf": "btfkit.fitting.sbtf.trainable:SBTF",
     "neubtf": "btfkit.fitting.neubtf.trainable:NeuBTF",
 }
 # Models with a closed form: functions (source, *, settings, progress) -> Material.
@@ -21,6 +22,9 @@ CLOSED_FORM: dict[str, str] = {
     "pca": "btfkit.fitting.pca:pca",
 }
 MODELS: dict[str, str] = {**CLOSED_FORM, **TRAINED}
+# Models that learn of a relief from queries: functions (relief, *, seed) -> QuerySet. All others
+# learn from a BTF of it.
+TRACED: dict[str, str] = {"sbtf": "btfkit.fitting.sbtf.tracing:queries_of"}
 # What `--set` reaches of each; none of these modules needs torch.
 SETTINGS: dict[str, str] = {
     "lambert": "btfkit.fitting.lambert:Settings",
@@ -30,14 +34,20 @@ SETTINGS: dict[str, str] = {
     "rainer20": "btfkit.fitting.rainer.settings:Settings",
     "neumip": "btfkit.fitting.neumip.settings:Settings",
     "neumip-paper": "btfkit.fitting.neumip.settings:Settings",
+    "sbtf": "btfkit.fitting.sbtf.settings:Settings",
     "neubtf": "btfkit.fitting.neubtf.settings:Settings",
 }
 
 
+def loaded(home: str) -> Any:
+    """What a line of these tables names."""
+    module, name = home.split(":")
+    return getattr(importlib.import_module(module), name)
+
+
 def settings_of(model: str) -> dict[str, Any]:
     """Settings of a model with their defaults."""
-    module, name = SETTINGS[model].split(":")
-    return {f.name: f.default for f in fields(getattr(importlib.import_module(module), name))}
+    return {f.name: f.default for f in fields(loaded(SETTINGS[model]))}
 
 
 def cuda_device() -> str:

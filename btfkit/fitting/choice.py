@@ -12,7 +12,6 @@ from scipy.ndimage import gaussian_filter
 
 from btfkit import directions
 from btfkit.btf import BTF
-from btfkit.fitting import MODELS
 from btfkit.queries import QuerySet
 
 # Fewer pairs say little about gloss; fewer than the second are told apart by their neighbours.
@@ -48,16 +47,15 @@ def choose(source: BTF | QuerySet) -> Choice:
 
 def _for_queries(queries: QuerySet) -> Choice:
     valid = queries.subset(queries.valid())
-    curved = valid.curvature is not None and bool(np.any(valid.curvature != 0))
-    clear = valid.opacity is not None and bool(np.any(valid.opacity < 1))
-    if (curved or clear) and "sbtf" in MODELS:
-        what = " and ".join(
-            text for text, has in (("curvature", curved), ("opacity below 1", clear)) if has
-        )
-        return Choice("sbtf", (f"sbtf: the queries have {what}",))
+    bend = np.zeros(len(valid)) if valid.curvature is None else valid.curvature
+    holes = valid.opacity is not None and bool(np.any(valid.opacity[bend == 0] < 1))
+    unfitted = "what is seen through on the plane is not fitted: no model here knows holes"
+    if np.any(bend != 0):
+        reasons = ["sbtf: the queries have curvature, under which rays may pass the material"]
+        return Choice("sbtf", (*reasons, unfitted) if holes else tuple(reasons))
     reasons = ["neumip: queries have no images that could guide a texture"]
-    if curved or clear:
-        reasons.append("their curvature and opacity are not fitted: no model here knows them")
+    if holes:
+        reasons.append(unfitted)
     settings = {}
     if valid.footprint is None or not np.any(valid.footprint > 0.5):
         settings["levels"] = "1"

@@ -16,7 +16,7 @@ import numpy as np
 from btfkit.btf import BTF
 from btfkit.errors import FitError, unknown
 from btfkit.files import refuse_existing
-from btfkit.fitting import CLOSED_FORM, MODELS
+from btfkit.fitting import CLOSED_FORM, MODELS, TRACED, loaded
 from btfkit.fitting.phases import Phases, Told
 from btfkit.fitting.reading import masked, read_once
 from btfkit.fitting.report import FitReport
@@ -55,7 +55,8 @@ def fit(
     torch was imported before it: on a busy machine such a fit is several times slower.
 
     Args:
-        source: a BTF, queries with answers, or a relief (traced on a Bonn-81 grid first).
+        source: a BTF, queries with answers, or a relief (traced on a Bonn-81 grid first, or as
+            the model asks for).
         model: a name of `MODELS`, or "auto".
         budget_s: wall time from the end of reading to the end, seconds, evaluation included: that
             takes at most a tenth, at least 2 s. `steps` takes its place where given.
@@ -83,14 +84,17 @@ def fit(
     plan = Plan(steps, final, resume, force or resume, seed, holdout, device)
     phases = Phases(budget_s if steps is None else None, phase)
     phases.begin("reading")
-    data = read_once(_traced(source))
+    data = read_once(_traced(source, model, seed))
     chosen, choice, parts = _chosen(data, model)
+    relief = source if isinstance(source, Relief) else None
+    if relief is not None and chosen in TRACED:
+        parts = {**parts, "wrap": relief.wrap}
     given = {**parts, **as_text(settings or {})}
     if chosen in CLOSED_FORM:
         train = split(len(data), holdout, seed)[0]
         material, run = solved(data.subset(train), chosen, given, plan, progress)
     else:
-        material, run = trained(data, chosen, given, plan, phases, progress)
+        material, run = trained(data, chosen, given, plan, phases, progress, relief)
     if phases.late():
         said = f"starting took {phases.seconds['starting']:.0f} s of a budget of {budget_s:g} s"
         choice = (*choice, f"{said}: training had its least share, and ended late")
@@ -162,9 +166,12 @@ def _cpu_alone(model: str, used: str, device: str) -> bool:
     return used == "cpu" and device != "cpu" and bool(gpu())
 
 
-def _traced(source: BTF | QuerySet | Relief) -> BTF | QuerySet:
+def _traced(source: BTF | QuerySet | Relief, model: str, seed: int) -> BTF | QuerySet:
     if not isinstance(source, Relief):
         return source
+    if model in TRACED:
+        queries: QuerySet = loaded(TRACED[model])(source, seed=seed)
+        return queries
     from btfkit import directions
     from btfkit.relief.trace import traced_btf
 

@@ -23,6 +23,7 @@ from torch import Tensor
 from btfkit.errors import FitError, FormatError
 from btfkit.files import whole
 from btfkit.materials.base import Material
+from btfkit.relief.relief import Relief
 
 # Held-out looks at the model: enough for a curve, and a small share of the time.
 _LOOKS = 12
@@ -81,6 +82,10 @@ class Trainable(ABC):
     def untrained(self) -> tuple[str, ...]:
         """Parts that answer as if never trained, or hardly, one sentence each; none by default."""
         return ()
+
+    def know(self, relief: Relief) -> None:
+        """Take what the relief behind the data tells; most models learn it from the data."""
+        del relief
 
     def on_device(self, device: str) -> Trainable | None:
         """The same model trained on a torch device, or None where it knows the CPU alone."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -15,12 +14,13 @@ from numpy.typing import NDArray
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.files import room_for
-from btfkit.fitting import CLOSED_FORM, TRAINED
+from btfkit.fitting import CLOSED_FORM, TRAINED, loaded
 from btfkit.fitting.phases import Phases
 from btfkit.fitting.saving import state_file
 from btfkit.heldout import split
 from btfkit.materials.base import Material
 from btfkit.queries import QuerySet
+from btfkit.relief.relief import Relief
 
 Progress = Callable[[int, int], None]
 
@@ -68,7 +68,7 @@ def solved(
     if plan.out is not None and model == "interpolation":
         room_for(plan.out, 2 * _values(source), what="an interpolation of these data")
     start, cpu = time.perf_counter(), time.process_time()
-    function = _load(CLOSED_FORM[model])
+    function = loaded(CLOSED_FORM[model])
     material: Material = function(source, settings=settings, progress=progress)
     seconds = time.perf_counter() - start, time.process_time() - cpu
     return material, Ran(*seconds, 1, _samples(source))
@@ -81,8 +81,13 @@ def trained(
     plan: Plan,
     phases: Phases,
     progress: Progress | None,
+    relief: Relief | None = None,
 ) -> tuple[Material, Ran]:
-    """A model trained by steps, until they or the budget are spent, or Ctrl-C ends it."""
+    """A model trained by steps, until they or the budget are spent, or Ctrl-C ends it.
+
+    Args:
+        relief: what the source was traced from, if it was.
+    """
     import torch
 
     from btfkit import native
@@ -95,10 +100,12 @@ def trained(
     if isinstance(source, QuerySet):
         phases.begin("starting")
     train, test = split(len(source), plan.holdout, plan.seed)
-    trainable: loop.Trainable = _load(TRAINED[model])(
+    trainable: loop.Trainable = loaded(TRAINED[model])(
         source, train, test, settings=settings, generators=generators,
         progress=phases.reading(progress),
     )  # fmt: skip
+    if relief is not None:
+        trainable.know(relief)
     where = "cpu"
     if plan.device != "cpu" and gpu() and (moved := trainable.on_device(gpu())):
         trainable, where = moved, gpu()
@@ -138,8 +145,3 @@ def _samples(source: BTF | QuerySet) -> int:
 
 def _values(source: BTF | QuerySet) -> int:
     return math.prod(source.shape) if isinstance(source, BTF) else 0
-
-
-def _load(home: str) -> Any:
-    module, name = home.split(":")
-    return getattr(importlib.import_module(module), name)

@@ -14,6 +14,7 @@ MODELS: dict[str, str] = {
     "neubtf": "btfkit.materials.neubtf:NeuBTF",
     "neumip": "btfkit.materials.neumip.material:NeuMIP",
     "neumip-paper": "btfkit.materials.neumip.material:NeuMIPPaper",
+    "sbtf": "btfkit.materials.sbtf.material:SBTF",
 }
 # Models whose `program()` gives their evaluation as data.
 PROGRAMS: tuple[str, ...] = (
@@ -23,6 +24,7 @@ PROGRAMS: tuple[str, ...] = (
     "neubtf",
     "neumip",
     "neumip-paper",
+    "sbtf",
 )
 
 

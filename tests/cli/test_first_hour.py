@@ -377,7 +377,7 @@ def never(*_: Any, **__: Any) -> None:
 def test_a_missing_folder_is_found_before_training(
     model: str, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("btfkit.fitting.training._load", never)
+    monkeypatch.setattr("btfkit.fitting.training.loaded", never)
     assert run(command, ["fit", "--model", model, "-o", "no/where.safetensors"]) == 1
     assert "no is not a folder; create it first" in capsys.readouterr().err
 

@@ -140,10 +140,21 @@ def test_queries_get_the_levels_that_their_footprints_ask_for() -> None:
     assert frontal.settings["offset"] == "0"
 
 
-def test_queries_with_curvature_or_holes_ask_for_a_model_that_knows_them() -> None:
-    for name in ("curvature", "opacity"):
-        choice = choose(queries(**{name: np.linspace(0, 1, 64)}))
-        assert any("no model here knows them" in why for why in choice.reasons)
+def test_queries_with_curvature_ask_for_a_model_that_knows_it() -> None:
+    bend = np.linspace(0, 1, 64)
+    choice = choose(queries(curvature=bend, opacity=1 - bend))
+    assert choice.model == "sbtf"
+    assert choice.reasons == (
+        "sbtf: the queries have curvature, under which rays may pass the material",
+    )
+    assert choose(queries(curvature=0 * bend)).model == "neumip"
+
+
+def test_holes_on_the_plane_are_said_not_to_be_fitted() -> None:
+    bend = np.linspace(0, 1, 64)
+    for parts in ({}, {"curvature": bend}):
+        choice = choose(queries(opacity=bend, **parts))
+        assert any("no model here knows holes" in why for why in choice.reasons)
 
 
 def test_fit_takes_what_was_chosen_and_the_user_has_the_last_word() -> None:

@@ -37,6 +37,7 @@ TINY: dict[str, tuple[int, dict[str, str]]] = {
     "rainer20": (200, {"pairs": "16", "texels": "32", "subset": "16", "rate": "5e-3"}),
     "neumip": (150, {"batch": "1024", "levels": "1"}),
     "neumip-paper": (150, {"batch": "1024", "levels": "1"}),
+    "sbtf": (150, {"batch": "1024", "levels": "1"}),
     "neubtf": (150, {"pairs": "8", "texels": "64", "encoder": "false"}),
 }
 FULL_SPHERE = {name for name in MODELS if materials.material_class(name).full_sphere}

@@ -27,7 +27,10 @@ _HELD_PAIRS = 16
 @final
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """b queries with answers; footprint None is 0.5 throughout, weight None is 1."""
+    """b queries with answers; footprint None is 0.5 throughout, weight None is 1.
+
+    curvature None is the plane.
+    """
 
     uv: Array
     light: Array
@@ -35,6 +38,7 @@ class Batch:
     footprint: Array | None
     target: Array
     weight: Array | None = None
+    curvature: Array | None = None
 
     def __len__(self) -> int:
         return len(self.uv)
@@ -173,10 +177,21 @@ class TexelSource(Source):
 
 @final
 class RowSource(Source):
-    """Rows of a query file with their own footprints, in one shuffled order."""
+    """Rows of a query file with their own footprints, in one shuffled order.
+
+    Args:
+        curved: whether curvature and opacity count: what is not seen, having an opacity below
+            1/2, is no measurement.
+    """
 
     def __init__(
-        self, queries: QuerySet, train: NDArray[np.intp], test: NDArray[np.intp], *, seed: int
+        self,
+        queries: QuerySet,
+        train: NDArray[np.intp],
+        test: NDArray[np.intp],
+        *,
+        seed: int,
+        curved: bool = False,
     ) -> None:
         if queries.rgb is None:
             raise FitError("these queries have no answers (no rgb): there is nothing to fit")
@@ -187,9 +202,10 @@ class RowSource(Source):
             raise FitError(f"none of {len(queries)} queries is finite and seen from above")
         rng = np.random.default_rng([seed, 11])
         # A batch is a run of rows of this order: no gathering while training.
-        self._rows = _rows(queries, rng.permutation(train))
+        self._rows = _rows(queries, rng.permutation(train), curved=curved)
         held = test[usable[test]]
-        self._held = _rows(queries, rng.permutation(held)[: _HELD_PAIRS * _HELD_TEXELS])
+        few = rng.permutation(held)[: _HELD_PAIRS * _HELD_TEXELS]
+        self._held = _rows(queries, few, curved=curved)
         self._seed = seed
 
     def batch(self, step: int, count: int) -> Batch:
@@ -208,19 +224,27 @@ class RowSource(Source):
         return self._held
 
 
-def _rows(queries: QuerySet, rows: NDArray[np.intp]) -> Batch:
+def _rows(queries: QuerySet, rows: NDArray[np.intp], *, curved: bool) -> Batch:
     assert queries.rgb is not None
     unit = (directions.normalize(d[rows]).astype(np.float32) for d in (queries.light, queries.view))
     footprint = None if queries.footprint is None else queries.footprint[rows]
     weight = None if queries.weight is None else queries.weight[rows]
     light, view = unit
-    return Batch(queries.uv[rows], light, view, footprint, queries.rgb[rows], weight)
+    target, bend = queries.rgb[rows], None
+    if curved:
+        if queries.opacity is not None:
+            target = np.where(queries.opacity[rows, None] < 0.5, np.float32(np.nan), target)
+        if queries.curvature is not None and queries.curvature.any():
+            bend = queries.curvature[rows]
+    return Batch(queries.uv[rows], light, view, footprint, target, weight, bend)
 
 
 def _cut(rows: Batch, at: slice) -> Batch:
     footprint = None if rows.footprint is None else rows.footprint[at]
     weight = None if rows.weight is None else rows.weight[at]
-    return Batch(rows.uv[at], rows.light[at], rows.view[at], footprint, rows.target[at], weight)
+    bend = None if rows.curvature is None else rows.curvature[at]
+    view, target = rows.view[at], rows.target[at]
+    return Batch(rows.uv[at], rows.light[at], view, footprint, target, weight, bend)
 
 
 def _nothing(channels: int) -> Batch:

@@ -4,21 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from btfkit.conventions import (
+    CURVATURE_UNIT,
     FLATTEST,
     KERNEL_INPUTS,
     LEAK,
     LEVELS_UNIT,
     LOOKS,
     LOWEST_COSINE,
+    LOWEST_SEEN,
     STEEPEST,
     displacement,
 )
 from btfkit.fitting.neumip.data import Batch
+from btfkit.native.neural import bent
 from btfkit.native.neural.layout import Layout, Network, Pyramid
+from btfkit.program import Heights
 
 
 def forward(
@@ -29,6 +35,7 @@ def forward(
     light: Tensor,
     view: Tensor,
     footprint: Tensor | None = None,
+    curvature: Tensor | None = None,
 ) -> Tensor:
     """The decoder's raw numbers (b, outputs) for flat queries; differentiable.
 
@@ -36,8 +43,9 @@ def forward(
         layout: the model. weights: (layout.weights,). texels: (layout.texels, 8).
         uv: (b, 2). light, view: (b, 3) unit vectors.
         footprint: (b,) texels of the data's grid; None is 0.5 throughout.
+        curvature: (b,) 1/tile width, of curved heights; None is the plane.
     """
-    known = directions(light, view, footprint)
+    known = directions(light, view, footprint, curvature)
     offset_weights, decoder_weights = layout.split(weights)
     textures = layout.textures(texels)
     depth = torch.zeros((), dtype=uv.dtype, device=uv.device)
@@ -47,9 +55,15 @@ def forward(
         depth = run(network, offset_weights, [psi], known) * layout.depth_scale
     elif layout.heights is not None:
         depth = ray_depth(layout, layout.surface(texels), uv, view)
+    away, toward = step(light, layout), step(view, layout)
+    if layout.curved and curvature is not None:
+        on_curve, turn = bent_depth(layout, layout.surface(texels), uv, view, curvature)
+        depth = torch.where((curvature != 0)[:, None], on_curve, depth)
+        light, view = turned(light, view, torch.where(curvature != 0, turn, 0.0))
+        known = directions(light, view, footprint, curvature)
     features = []
     for bank, levels in zip(layout.banks, textures, strict=True):
-        move = bank.view * step(view, layout) - bank.light * step(light, layout)
+        move = bank.view * toward - bank.light * away
         features.append(_between_levels(bank, levels, uv + depth * move, known, wrap=layout.wrap))
     half = torch.stack([known[name] for name in ("hx", "hy", "hz")], dim=1)
     for k in range(layout.frames):
@@ -77,6 +91,54 @@ def ray_depth(layout: Layout, surface: Tensor, uv: Tensor, view: Tensor) -> Tens
     height = bilinear(surface[..., None], here.detach(), wrap=layout.wrap)
     t = t + (height - height.detach()) / clear
     return t * view[:, 2:].clamp(min=LOWEST_COSINE) / upward * layout.depth_scale
+
+
+def bent_depth(
+    layout: Layout, surface: Tensor, uv: Tensor, view: Tensor, curvature: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The same on a curved surface, and the turn (b,) of the ray, which has no gradient.
+
+    `native.neural.bent` finds where the ray ends.
+    """
+    found = Heights(surface.detach().numpy(), layout.depth_scale, True)
+    parts = [part.detach().numpy() for part in (view, curvature)]
+    rays = bent.rays_of(found, parts[0], parts[1], layout.aspect)
+    met = bent.meet(
+        found, uv.detach().numpy(), parts[0], parts[1], aspect=layout.aspect, wrap=layout.wrap
+    )
+    along = torch.from_numpy(rays.along)
+    here = (uv + torch.from_numpy(met.way)[:, None] * along).requires_grad_()
+    with torch.enable_grad():
+        height = bilinear(surface.detach()[..., None], here, wrap=layout.wrap)
+        (slope,) = torch.autograd.grad(height.sum(), here)
+    climb = (slope * along).sum(1).numpy()
+    moved = rays.share / bent.clearance(rays, met.way, climb) * layout.depth_scale
+    height = bilinear(surface[..., None], here.detach(), wrap=layout.wrap)
+    rise = (height - height.detach()) * torch.from_numpy(moved * met.opacity)[:, None]
+    return torch.from_numpy(met.depth)[:, None] + rise, torch.from_numpy(met.turn)
+
+
+def turned(light: Tensor, view: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
+    """Directions as layers take them where rays end; see `bent.turned`."""
+    seen, angle = view.numpy(), turn.numpy()
+    lit, there = (bent.turned(each.numpy(), seen, angle) for each in (light, view))
+    there[:, 2] = np.where(angle == 0, there[:, 2], np.maximum(there[:, 2], LOWEST_SEEN))
+    return torch.from_numpy(lit), torch.from_numpy(there)
+
+
+def dark(layout: Layout, texels: Tensor, batch: Batch) -> NDArray[np.bool_]:
+    """(b,) queries of a batch that see nothing of curved heights, or nothing that is lit."""
+    if not layout.curved:
+        return np.zeros(len(batch), bool)
+    if batch.curvature is None:
+        return batch.light[:, 2] <= 0
+    found = Heights(layout.surface(texels).detach().numpy(), layout.depth_scale, True)
+    met = bent.meet(
+        found, batch.uv, batch.view, batch.curvature, aspect=layout.aspect, wrap=layout.wrap
+    )
+    curved = batch.curvature != 0
+    light = bent.turned(batch.light, batch.view, np.where(curved, met.turn, 0))
+    return (curved & (met.opacity == 0)) | (light[:, 2] <= 0)
 
 
 def _crossing(surface: Tensor, uv: Tensor, along: Tensor, *, wrap: bool) -> Tensor:
@@ -140,8 +202,10 @@ def step(direction: Tensor, layout: Layout) -> Tensor:
     return torch.stack(displacement(direction[:, 0], direction[:, 1], cosine, layout.aspect), 1)
 
 
-def directions(light: Tensor, view: Tensor, footprint: Tensor | None) -> dict[str, Tensor]:
-    """Every number of `KERNEL_INPUTS` on the plane, (b,) each."""
+def directions(
+    light: Tensor, view: Tensor, footprint: Tensor | None, curvature: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Every number of `KERNEL_INPUTS`, (b,) each."""
     total = light + view
     length = torch.linalg.vector_norm(total, dim=1, keepdim=True)
     none = length < 1e-6
@@ -151,8 +215,10 @@ def directions(light: Tensor, view: Tensor, footprint: Tensor | None) -> dict[st
     level = torch.zeros_like(cos_diff)
     if footprint is not None:
         level = torch.log2(2 * footprint.clamp(0.5, 1e30))
-    plane = torch.zeros_like(level)
-    columns = [*light.T, *view.T, *half.T, cos_diff, level / LEVELS_UNIT, plane]
+    curved = torch.zeros_like(level)
+    if curvature is not None:
+        curved = curvature / (CURVATURE_UNIT + curvature.abs())
+    columns = [*light.T, *view.T, *half.T, cos_diff, level / LEVELS_UNIT, curved]
     return dict(zip(KERNEL_INPUTS, columns, strict=True))
 
 
@@ -222,8 +288,14 @@ def loss_on_batch(
     layout: Layout, weights: Tensor, texels: Tensor, batch: Batch, kind: str
 ) -> Tensor:
     """The loss of a batch, differentiable."""
-    answer = log_answer(layout, forward(layout, weights, texels, *tensors(batch)))
+    bend = None if batch.curvature is None else torch.from_numpy(batch.curvature)
+    raw = forward(layout, weights, texels, *tensors(batch), bend)
+    answer = log_answer(layout, raw)
     weight = None if batch.weight is None else torch.from_numpy(batch.weight)
+    unseen = dark(layout, texels, batch)
+    if unseen.any():
+        kept = torch.from_numpy(~unseen).to(answer.dtype)
+        weight = kept if weight is None else weight * kept
     return loss_of(layout, answer, torch.from_numpy(batch.target), weight, kind)
 
 

@@ -21,7 +21,6 @@ from btfkit.fitting.neumip.recipe import Recipe
 from btfkit.fitting.neumip.settings import PaperSettings
 from btfkit.fitting.neumip.start import initial_texels
 from btfkit.footprint import gaussian
-from btfkit.materials.base import Material
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.native.neural.adam import adam_plain
@@ -34,7 +33,7 @@ class NeuMIPPaper(Recipe[PaperSettings]):
     """The published recipe: Adam at a constant rate, blurred textures, batches of 4 a texel."""
 
     model: ClassVar[str] = "neumip-paper"
-    material_type: ClassVar[type[Material]] = evaluated.NeuMIPPaper
+    material_type: ClassVar[type[evaluated.NeuMIPMaterial]] = evaluated.NeuMIPPaper
     settings_type = PaperSettings
 
     def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:

@@ -17,7 +17,7 @@ from btfkit.fitting.loop import Generators, Trainable
 from btfkit.fitting.neumip.data import Batch, RowSource, Source, TexelSource
 from btfkit.fitting.neumip.settings import Shared, refuse_unused
 from btfkit.footprint import most_levels
-from btfkit.materials.base import Header, Material
+from btfkit.materials.base import Header
 from btfkit.materials.neumip import arrays as neumip_arrays
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.spec import NeuMIPSpec
@@ -31,7 +31,7 @@ S = TypeVar("S", bound=Shared)
 class Recipe(Trainable, ABC, Generic[S]):
     """What both recipes share: data, flat parameters, state, score."""
 
-    material_type: ClassVar[type[Material]]
+    material_type: ClassVar[type[evaluated.NeuMIPMaterial]]
     settings_type: type[S]
 
     def __init__(
@@ -46,7 +46,7 @@ class Recipe(Trainable, ABC, Generic[S]):
     ) -> None:
         self.settings = s = parsed(self.settings_type, self.model, settings)
         refuse_unused(s, self.model, settings, pictures=isinstance(source, BTF))
-        self._generators = generators
+        self._generators, self._data = generators, source
         self._header = _header(source, s)
         size = _texture_size(self._header.grid, s.size)
         levels = s.levels or _levels_for(source, size)
@@ -59,7 +59,9 @@ class Recipe(Trainable, ABC, Generic[S]):
                 pool_bytes=s.pool_mb << 20, progress=progress,
             )  # fmt: skip
         else:
-            self._source = RowSource(source, train, test, seed=generators.seed)
+            self._source = RowSource(
+                source, train, test, seed=generators.seed, curved=self.spec.curved
+            )
         self.masked = self._source.masked
         self._held = self._source.held_out()
         self._pairs = len(train)
@@ -97,12 +99,12 @@ class Recipe(Trainable, ABC, Generic[S]):
     def _put(self, state: Mapping[str, Tensor]) -> None:
         """Take back what `_tensors` gave."""
 
-    def _answers(self, material: evaluated.NeuMIP, held: Batch) -> Array:
+    def _answers(self, material: evaluated.NeuMIPMaterial, held: Batch) -> Array:
         """Reflectance (b, c) of a material for the held-out queries."""
         blur = 0.5 if held.footprint is None else held.footprint
         return material.evaluate(held.uv, held.light, held.view, blur).reflectance
 
-    def material(self) -> Material:
+    def material(self) -> evaluated.NeuMIPMaterial:
         arrays = neumip_arrays.name_arrays(self.spec, self.layout, *self._current())
         return self.material_type(self.spec, arrays, self._header)
 
@@ -111,12 +113,7 @@ class Recipe(Trainable, ABC, Generic[S]):
         good = np.isfinite(held.target)
         if not good.any():
             return math.nan
-        material = evaluated.NeuMIP(
-            self.spec,
-            neumip_arrays.name_arrays(self.spec, self.layout, *self._current()),
-            self._header,
-        )
-        answer = self._answers(material, held)
+        answer = self._answers(self.material(), held)
         with np.errstate(invalid="ignore"):
             error = np.log1p(np.maximum(held.target, -0.1)) - np.log1p(answer)
         return float(np.square(error[good]).mean())

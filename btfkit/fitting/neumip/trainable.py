@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, final
+from typing import Any, ClassVar, TypeVar, final
 
 import numpy as np
 from torch import Tensor
@@ -18,10 +18,9 @@ from btfkit.fitting.neumip.data import Batch
 from btfkit.fitting.neumip.engines.base import MOMENTS, PARAMETERS, Engine, Step
 from btfkit.fitting.neumip.engines.compiled import Compiled, Plain
 from btfkit.fitting.neumip.recipe import Recipe
-from btfkit.fitting.neumip.settings import INPUTS, Settings
+from btfkit.fitting.neumip.settings import INPUTS, Settings, Stepped
 from btfkit.fitting.neumip.start import initial_texels, initial_weights
 from btfkit.fitting.schedule import pace
-from btfkit.materials.base import Material
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.arrays import aligned
 from btfkit.materials.neumip.spec import NeuMIPSpec
@@ -34,16 +33,11 @@ _SMOOTH_HALVES = 5
 _DECAY_PAIRS = 60
 
 
-@final
-class NeuMIP(Recipe[Settings]):
-    """NeuMIP with what docs/neumip.md found to be better; an engine takes its steps."""
+S = TypeVar("S", bound=Stepped)
 
-    model: ClassVar[str] = "neumip"
-    material_type: ClassVar[type[Material]] = evaluated.NeuMIP
-    settings_type = Settings
 
-    def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:
-        return spec_of(self.settings, size, levels, len(self._header.channels))
+class Marching(Recipe[S]):
+    """What an engine takes the steps of: `neumip`, and `sbtf` on curved surfaces."""
 
     def _begin(self, rng: np.random.Generator) -> None:
         layout = self.layout
@@ -70,7 +64,7 @@ class NeuMIP(Recipe[Settings]):
     def _put(self, state: Mapping[str, Tensor]) -> None:
         self.engine.restore(state)
 
-    def _answers(self, material: evaluated.NeuMIP, held: Batch) -> Array:
+    def _answers(self, material: evaluated.NeuMIPMaterial, held: Batch) -> Array:
         return self.engine.answers(material, held)
 
     def step(self, progress: float) -> float:
@@ -96,6 +90,26 @@ class NeuMIP(Recipe[Settings]):
             blur=smooth * 2 ** (-_SMOOTH_HALVES * progress),
         )
 
+    def _batch_size(self, progress: float) -> int:
+        if self.settings.batch:
+            return self.settings.batch
+        h, w = self.spec.size
+        # 2^13 at 128 x 128, 2^16 at 512 x 512; larger towards the end, where noise costs most.
+        size = 2**13 * (h * w / 2**14) ** 0.75
+        return int(np.clip(2 ** round(math.log2(size)), 2**10, 2**17)) << int(progress > 0.7)
+
+
+@final
+class NeuMIP(Marching[Settings]):
+    """NeuMIP with what docs/neumip.md found to be better."""
+
+    model: ClassVar[str] = "neumip"
+    material_type: ClassVar[type[evaluated.NeuMIPMaterial]] = evaluated.NeuMIP
+    settings_type = Settings
+
+    def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:
+        return spec_of(self.settings, size, levels, len(self._header.channels))
+
     def on_device(self, device: str) -> Trainable:
         from btfkit.fitting.neumip.engines.device import OnDevice
 
@@ -104,14 +118,6 @@ class NeuMIP(Recipe[Settings]):
             loss=self.settings.loss, matrix=self.settings.matrix,  # type: ignore[arg-type]
         )  # fmt: skip
         return self
-
-    def _batch_size(self, progress: float) -> int:
-        if self.settings.batch:
-            return self.settings.batch
-        h, w = self.spec.size
-        # 2^13 at 128 x 128, 2^16 at 512 x 512; larger towards the end, where noise costs most.
-        size = 2**13 * (h * w / 2**14) ** 0.75
-        return int(np.clip(2 ** round(math.log2(size)), 2**10, 2**17)) << int(progress > 0.7)
 
 
 def spec_of(s: Settings, size: tuple[int, int], levels: int, channels: int = 3) -> NeuMIPSpec:

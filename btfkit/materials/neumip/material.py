@@ -22,8 +22,8 @@ from btfkit.program import Program
 from btfkit.queries import Query
 
 
-class _NeuMIP(Material):
-    """Both NeuMIPs: what differs is the name, and how they were trained."""
+class NeuMIPMaterial(Material):
+    """What all NeuMIPs share, SBTF among them: the arrays, the kernels and the program."""
 
     spec_type: ClassVar[type] = NeuMIPSpec
     has_levels: ClassVar[bool] = True
@@ -96,22 +96,22 @@ class _NeuMIP(Material):
 
 
 @final
-class NeuMIP(_NeuMIP):
+class NeuMIP(NeuMIPMaterial):
     """NeuMIP with what docs/neumip.md found to be better at the same cost."""
 
     model: ClassVar[str] = "neumip"
 
 
 @final
-class NeuMIPPaper(_NeuMIP):
+class NeuMIPPaper(NeuMIPMaterial):
     """NeuMIP as published."""
 
     model: ClassVar[str] = "neumip-paper"
 
 
 def in_precision(
-    material: _NeuMIP, precision: Precision, networks: Networks | None = None
-) -> _NeuMIP:
+    material: NeuMIPMaterial, precision: Precision, networks: Networks | None = None
+) -> NeuMIPMaterial:
     """The same model with its textures stored as float32, float16 or int8.
 
     Args:

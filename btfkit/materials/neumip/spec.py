@@ -29,6 +29,7 @@ class NeuMIPSpec:
         offset: channels of the offset texture, 1 to 8; 0 for no offset network.
         heights: whether the ray depth is where the view ray meets a texture of heights; then
             there is no offset network, whatever `offset` says.
+        curved: whether curvature bends the rays through the heights.
         frames: vectors among the pyramid's channels, three each, whose products with the half
             vector and the light the decoder takes too: 0, 1 or 2.
         hidden, offset_hidden: widths of the hidden layers.
@@ -62,6 +63,7 @@ class NeuMIPSpec:
     heights: bool = False
     frames: int = 0
     networks: Networks = "float32"
+    curved: bool = False
 
     def layout(self, header: Header) -> Layout:
         """The model as its kernels see it."""
@@ -102,4 +104,5 @@ class NeuMIPSpec:
             aspect=header.aspect,
             depth_scale=self.depth_scale,
             wrap=header.wrap == "wrap",
+            curved=self.curved,
         )

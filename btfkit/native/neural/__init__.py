@@ -52,14 +52,20 @@ class Kernel:
         light: Array,
         view: Array,
         footprint: Array | None = None,
+        curvature: Array | None = None,
         *,
         raw: bool = False,
+        opacity: Array | None = None,
     ) -> Array:
-        """As `evaluate_plain`; every array float32 and contiguous."""
+        """As `evaluate_plain`; every array float32 and contiguous.
+
+        Args:
+            opacity: (b,) to be written, of curved heights; None where it is not asked for.
+        """
         outputs = self._layout.decoder.widths[-1] if raw else self._layout.channels
         rgb = np.empty((len(uv), outputs), np.float32)
-        common = (raw, self._threads, self._variant)
-        self._model.evaluate(weights, texels, uv, light, view, footprint, rgb, False, *common)
+        parts = (weights, texels, uv, light, view, footprint, curvature, rgb, opacity)
+        self._model.evaluate(*parts, False, raw, self._threads, self._variant)
         return rgb
 
     def evaluate_lights(
@@ -70,20 +76,31 @@ class Kernel:
         lights: Array,
         view: Array,
         footprint: Array | None = None,
+        curvature: Array | None = None,
+        *,
+        opacity: Array | None = None,
     ) -> Array:
         """(m, b, c) reflectance of b views under m lights (m, 3) that all of them share.
 
-        What does not depend on the light is computed once a view.
+        What does not depend on the light is computed once a view; `opacity` as in `evaluate`.
         """
         rgb = np.empty((len(lights), len(uv), self._layout.channels), np.float32)
-        common = (False, self._threads, self._variant)
-        self._model.evaluate(weights, texels, uv, lights, view, footprint, rgb, True, *common)
+        parts = (weights, texels, uv, lights, view, footprint, curvature, rgb, opacity)
+        self._model.evaluate(*parts, True, False, self._threads, self._variant)
         return rgb
 
-    def depths(self, weights: Array, texels: Array, uv: Array, view: Array) -> Array:
+    def depths(
+        self,
+        weights: Array,
+        texels: Array,
+        uv: Array,
+        view: Array,
+        curvature: Array | None = None,
+    ) -> Array:
         """As `depths_plain`."""
         out = np.empty(len(uv), np.float32)
-        self._model.depths(weights, texels, uv, view, out, self._threads, self._variant)
+        common = (self._threads, self._variant)
+        self._model.depths(weights, texels, uv, view, curvature, out, *common)
         return out
 
     def train(
@@ -98,12 +115,14 @@ class Kernel:
         weight: Array | None = None,
         *,
         loss: Loss = "square",
+        curvature: Array | None = None,
     ) -> tuple[float, int]:
         """Loss of one batch against log(1 + max(target, -0.1)); its gradients are added up here.
 
         Args:
             target: (b, c) reflectance; values that are not finite count nothing.
             weight: (b,) of each query, None for 1.
+            curvature: (b,) 1/tile width, of curved heights; a ray that passes them has weight 0.
 
         Returns:
             The loss, a mean over b x c, and how many values counted.
@@ -111,7 +130,7 @@ class Kernel:
         kind = 0 if loss == "square" else 1
         common = (kind, self._threads, self._variant)
         return self._model.train(
-            weights, texels, uv, light, view, footprint, target, weight, *common
+            weights, texels, uv, light, view, footprint, curvature, target, weight, *common
         )
 
     def gradients(self) -> tuple[Array, Array]:
@@ -193,6 +212,7 @@ def _tables(layout: Layout, networks: Networks) -> dict[str, Any]:
         "textures": textures,
         "banks": banks,
         "heights": heights,
+        "curved": layout.curved,
         "offset": offset,
         "decoder": _network(layout.decoder),
     }

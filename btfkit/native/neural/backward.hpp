@@ -8,6 +8,8 @@ NEUMIP_TARGET inline void Tile::judge(const Batch& b, int64_t at, int valid, int
     float* target = slopes[0];
     float* weight = slopes[1];
     for (int i = 0; i < n; ++i) weight[i] = i < valid ? (b.weight ? b.weight[at + i] : 1.f) : 0.f;
+    if (plan.curved)  // what would be seen of what is not seen, or not lit, teaches nothing
+        for (int i = 0; i < n; i += L) store(weight + i, load(weight + i) * seen_and_lit(i));
     for (int k = 0; k < c; ++k) {
         const float* from = b.target + at * c + k;
         for (int i = 0; i < valid; ++i) target[i] = from[int64_t(i) * c];
@@ -46,8 +48,9 @@ NEUMIP_TARGET inline void Tile::train(const Batch& b, int64_t at, int valid, int
     const int n = padded(valid);
     set_position(b.uv + 2 * at, b.footprint ? b.footprint + at : nullptr, valid, n);
     set_view(b.view + 3 * at, valid, n);
-    set_light(b.light + 3 * at, valid, n, false);
+    set_curvature(b.curvature ? b.curvature + at : nullptr, valid, n);
     find_features<true>(*this, b, at, valid, n);
+    set_light(b.light + 3 * at, valid, n, false);
     if (plan.needs_light())
         for (int half = 0; half < 2; ++half)
             look_up_features(*this, half_from(half), half_size(half, n), half, valid, true);
@@ -90,14 +93,24 @@ NEUMIP_TARGET inline void Tile::train(const Batch& b, int64_t at, int valid, int
 }
 
 NEUMIP_TARGET inline void Tile::move_heights(int n, int valid, Gradient& g) {
+    if (!bent) {
+        std::fill(in[kClear], in[kClear] + n, 1.f);
+        std::fill(in[kLeast], in[kLeast] + n, kFlattest);
+    }
     for (int i = 0; i < n; i += L) {
         const F z = load(in[kCross] + i);
         store(position[0] + i, load(in[kU] + i) + z * load(in[kRayU] + i));
         store(position[1] + i, load(in[kV] + i) + z * load(in[kRayV] + i));
         store(in[kSlope] + i, load(in[kSlope] + i) * load(in[kLift] + i));
+        if (!bent) continue;
+        const I curved = load(in[kBend] + i) != all(0.f);
+        for (int row : {kRayU, kRayV}) {
+            const F step = load(in[row] + i);
+            store(in[row] + i, select(curved, -step, step));
+        }
     }
-    scatter_heights(surface, position[0], position[1], in[kRayU], in[kRayV], in[kSlope], n,
-                    valid, g);
+    scatter_heights(surface, position[0], position[1], in[kRayU], in[kRayV], in[kClear],
+                    in[kLeast], in[kSlope], n, valid, g);
 }
 
 // Adds to the gradient of the depth what moves this bank's lookup.

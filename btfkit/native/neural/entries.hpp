@@ -4,16 +4,23 @@ inline int next_size(int64_t at, int64_t to) {
     return int(std::max<int64_t>(std::min<int64_t>(kTile, to - at - kTile), 0));
 }
 
-// rgb (lights or 1, size, outputs) for queries [from, to); lights: directions shared by all.
+// rgb (lights or 1, size, outputs) for queries [from, to); lights: directions shared by all;
+// opacity (size) of curved heights, or null.
 NEUMIP_TARGET void evaluate(const Plan& plan, const float* weights, const float* texels,
                             const Batch& b, const float* lights, int64_t count, int64_t from,
-                            int64_t to, float* rgb, bool raw) {
+                            int64_t to, float* rgb, float* opacity, bool raw) {
     auto tile = std::make_unique<Tile>(plan, weights, texels, b, false);
     const int64_t outputs = raw ? plan.decoder.widths.back() : plan.channels;
     for (int64_t at = from; at < to; at += kTile) {
         const int valid = int(std::min<int64_t>(kTile, to - at));
         tile->stage_one(b, at, valid);
         if (at + kTile < to) tile->look_ahead(b, at + kTile, next_size(at, to));
+        if (opacity) std::copy_n(tile->in[Tile::kOpaque], valid, opacity + at);
+        if (!raw && !tile->seen(valid)) {
+            for (int64_t j = 0; j < (lights ? count : 1); ++j)
+                std::fill_n(rgb + (j * b.size + at) * outputs, valid * outputs, 0.f);
+            continue;
+        }
         if (lights == nullptr) {
             tile->stage_two(b.light + 3 * at, false, valid, rgb + at * outputs, raw);
             continue;

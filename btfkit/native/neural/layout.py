@@ -103,6 +103,7 @@ class Layout:
         offset: the texture and network of the ray depth; None without them.
         heights: (h, w) of a texture of heights, whose first crossing with the view ray gives the
             ray depth in place of the network; None without it.
+        curved: whether curvature bends the rays through the heights, which may then pass them.
         frames: vectors among the first bank's features, three numbers each: the decoder takes
             the products of each with the half vector and with the light, after the features.
         channels: of the answer. output: "log" as it comes, "relu" with negative numbers cut,
@@ -122,10 +123,15 @@ class Layout:
     aspect: float = 1.0
     depth_scale: float = 1.0
     wrap: bool = True
+    curved: bool = False
 
     def __post_init__(self) -> None:
         if self.offset and self.heights:
             raise ValueError("a ray depth comes from a network or from heights, not from both")
+        if self.curved and not self.heights:
+            raise ValueError("curvature bends rays through heights; there are none")
+        if "curvature" in self.decoder.directions and not self.curved:
+            raise ValueError("the input curvature is that of curved heights; there are none")
 
     @property
     def has_depth(self) -> bool:
@@ -203,7 +209,7 @@ class Layout:
         levels = self.textures(texels)
         depth: Heights | DepthNetwork | None = None
         if self.heights:
-            depth = Heights(self.surface(texels), self.depth_scale)
+            depth = Heights(self.surface(texels), self.depth_scale, self.curved)
         if self.offset:
             pyramid, network = self.offset
             texture = _texture("offset", pyramid, levels.pop(0))
@@ -230,6 +236,7 @@ class Layout:
             frames=self.frames,
             leveled=leveled,
             rounded=networks == "bfloat16",
+            full_sphere=self.curved,
         )
 
 

@@ -92,17 +92,19 @@ struct Surface {
 };
 
 // Adds to the gradient of the heights what the heights of the crossings are to move.
-// place: where rays meet the surface; along: (du, dv) of each; slope: gradient of the height.
+// u, v: where rays meet the surface; du, dv: their way, of which the slopes of the surface are
+// taken from `clear`, held at `least`; slope: gradient of the height.
 DEEP void scatter_heights(const Surface& s, const float* u, const float* v, const float* du,
-                          const float* dv, const float* slope, int n, int valid, Gradient& g) {
+                          const float* dv, const float* clear, const float* least,
+                          const float* slope, int n, int valid, Gradient& g) {
     for (int i = 0; i < n; i += L) {
         const Corners c = s.around(load(u + i), load(v + i));
         F h[4];
         for (int j = 0; j < 4; ++j) h[j] = gathered(s.heights, c.at[j]);
         const F gu = ((h[1] - h[0]) * (1.f - c.fy) + (h[3] - h[2]) * c.fy) * s.w;
         const F gv = ((h[2] - h[0]) * (1.f - c.fx) + (h[3] - h[1]) * c.fx) * s.h;
-        const F clear = 1.f - gu * load(du + i) - gv * load(dv + i);
-        const F d = load(slope + i) / larger(clear, all(kFlattest));
+        const F clearance = load(clear + i) - gu * load(du + i) - gv * load(dv + i);
+        const F d = load(slope + i) / larger(clearance, load(least + i));
         const F share[4] = {d * (1.f - c.fx) * (1.f - c.fy), d * c.fx * (1.f - c.fy),
                             d * (1.f - c.fx) * c.fy, d * c.fx * c.fy};
         for (int j = 0; j < 4; ++j)

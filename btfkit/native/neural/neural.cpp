@@ -140,6 +140,7 @@ class Model {
         p.output = code_of(kOutputNames, nb::cast<std::string>(tables["output"]), "output");
         p.channels = nb::cast<int>(tables["channels"]);
         p.frames = nb::cast<int>(tables["frames"]);
+        p.curved = nb::cast<bool>(tables["curved"]);
         p.half = nb::cast<bool>(tables["rounded"]);
         p.pairs = multiplies_pairs();
         for (nb::handle t : tables["textures"])
@@ -179,26 +180,32 @@ class Model {
     int64_t texels() const { return plan_.texels(); }
 
     void evaluate(In<float> w, In<float> t, In<float> uv, In<float> light, In<float> view,
-                  nb::object footprint, Out<float> rgb, bool shared, bool raw, int threads,
-                  const std::string& name) const {
-        Batch b = batch(w, t, uv, view, footprint);
+                  nb::object footprint, nb::object curvature, Out<float> rgb, nb::object opacity,
+                  bool shared, bool raw, int threads, const std::string& name) const {
+        Batch b = batch(w, t, uv, view, footprint, curvature);
         const int64_t outputs = raw ? plan_.decoder.widths.back() : plan_.channels;
         const int64_t lights = int64_t(light.size()) / 3;
         require(shared || lights == b.size, "one light a query");
         require(int64_t(rgb.size()) == (shared ? lights : 1) * b.size * outputs, "size of rgb");
         b.light = light.data();
         const auto v = variant(name);
-        float* out = rgb.data();
+        float *out = rgb.data(), *cover = nullptr;
+        if (!opacity.is_none()) {
+            require(plan_.curved, "opacity is that of curved heights");
+            const auto array = nb::cast<Out<float>>(opacity);
+            require(int64_t(array.size()) == b.size, "one opacity a query");
+            cover = array.data();
+        }
         const float* all = shared ? light.data() : nullptr;
         nb::gil_scoped_release release;
         spread(b.size, kGrain, useful(b.size, threads), [&](int, int64_t from, int64_t to) {
-            v.evaluate(plan_, w.data(), t.data(), b, all, lights, from, to, out, raw);
+            v.evaluate(plan_, w.data(), t.data(), b, all, lights, from, to, out, cover, raw);
         });
     }
 
-    void depths(In<float> w, In<float> t, In<float> uv, In<float> view, Out<float> out,
-                int threads, const std::string& name) const {
-        const Batch b = batch(w, t, uv, view, nb::none());
+    void depths(In<float> w, In<float> t, In<float> uv, In<float> view, nb::object curvature,
+                Out<float> out, int threads, const std::string& name) const {
+        const Batch b = batch(w, t, uv, view, nb::none(), curvature);
         require(int64_t(out.size()) == b.size, "size of the depths");
         const auto v = variant(name);
         nb::gil_scoped_release release;
@@ -209,9 +216,9 @@ class Model {
 
     // Adds the gradients of one batch to those kept here; returns (loss, values counted).
     nb::tuple train(In<float> w, In<float> t, In<float> uv, In<float> light, In<float> view,
-                    nb::object footprint, In<float> target, nb::object weight, int loss,
-                    int threads, const std::string& name) {
-        Batch b = batch(w, t, uv, view, footprint);
+                    nb::object footprint, nb::object curvature, In<float> target,
+                    nb::object weight, int loss, int threads, const std::string& name) {
+        Batch b = batch(w, t, uv, view, footprint, curvature);
         require(int64_t(light.size()) == 3 * b.size, "one light a query");
         require(int64_t(target.size()) == plan_.channels * b.size, "size of the targets");
         b.light = light.data();
@@ -305,7 +312,8 @@ class Model {
         return array.data();
     }
     Batch batch(const In<float>& w, const In<float>& t, const In<float>& uv,
-                const In<float>& view, const nb::object& footprint) const {
+                const In<float>& view, const nb::object& footprint,
+                const nb::object& curvature) const {
         require(int64_t(w.size()) == weights(), "size of the weights");
         require(int64_t(t.size()) == texels() * kChannels, "size of the texels");
         Batch b;
@@ -315,6 +323,10 @@ class Model {
         b.view = view.data();
         range(t.data(), b);
         if (!footprint.is_none()) b.footprint = floats(footprint, b.size, "one footprint a query");
+        if (!curvature.is_none()) {
+            require(plan_.curved, "these heights know no curvature");
+            b.curvature = floats(curvature, b.size, "one curvature a query");
+        }
         return b;
     }
     // Highest and lowest height: of texels that were frozen, those found then.
@@ -358,11 +370,14 @@ NB_MODULE(_neural, m) {
         .def_prop_ro("weights", &Model::weights)
         .def_prop_ro("texels", &Model::texels)
         .def("evaluate", &Model::evaluate, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
-             nb::arg().none(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg())
+             nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg().none(), nb::arg(), nb::arg(),
+             nb::arg(), nb::arg())
         .def("freeze", &Model::freeze)
-        .def("depths", &Model::depths)
+        .def("depths", &Model::depths, nb::arg(), nb::arg(), nb::arg(), nb::arg(),
+             nb::arg().none(), nb::arg(), nb::arg(), nb::arg())
         .def("train", &Model::train, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
-             nb::arg().none(), nb::arg(), nb::arg().none(), nb::arg(), nb::arg(), nb::arg())
+             nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg().none(), nb::arg(),
+             nb::arg(), nb::arg())
         .def("gradients", &Model::gradients)
         .def("adam", &Model::adam);
     m.def("blur", &neumip::blur);

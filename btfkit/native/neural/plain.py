@@ -14,12 +14,15 @@ from btfkit.conventions import (
     LEVELS_UNIT,
     LOOKS,
     LOWEST_COSINE,
+    LOWEST_SEEN,
     MOST_LOG,
     STEEPEST,
     displacement,
 )
+from btfkit.native.neural import bent
 from btfkit.native.neural.layout import Layout, Networks
-from btfkit.program import Dense, Heights, Program, Texture, frame_products
+from btfkit.native.neural.lookup import bilinear
+from btfkit.program import Dense, DepthNetwork, Heights, Program, Texture, frame_products
 
 Array = NDArray[Any]
 Known = dict[str, Array]
@@ -42,22 +45,31 @@ def answer(
         footprint: (b,) texels of the data's grid; None is 0.5 throughout.
         curvature: (b,) 1/tile width; None is the plane.
     """
-    raw, scaled = _last_layer(program, uv, light, view, footprint, curvature)
+    raw, scaled, (opacity, lit) = _last_layer(program, uv, light, view, footprint, curvature)
     heads = _heads(program, raw)
-    opacity = np.ones(len(uv), raw.dtype)
     if "opacity" in heads:
         opacity = _sigmoid(heads["opacity"][:, 0])
+    rgb = _reflectance(program, heads, scaled, light)
+    if program.opacity == "march":
+        rgb = rgb * ((opacity > 0) & lit)[:, None]
+    return rgb, opacity
+
+
+def _reflectance(
+    program: Program, heads: Mapping[str, Array], scaled: Array | None, light: Array
+) -> Array:
+    """(b, c) of the heads' numbers."""
     if program.output == "cosine":
-        return heads["linear"] * light[:, 2:], opacity
+        return heads["linear"] * light[:, 2:]
     if program.output == "released":
-        return released(heads["log"], heads["mask"]), opacity
+        return released(heads["log"], heads["mask"])
     y = heads["log"]
     if scaled is not None:
         c = y.shape[1]
         y = scaled[:, :c] + scaled[:, c:] * y
     if "mask" in heads:
         y = y * (0.1 + _sigmoid(heads["mask"]))
-    return np.expm1(np.clip(y, 0, MOST_LOG)), opacity
+    return np.expm1(np.clip(y, 0, MOST_LOG))
 
 
 def numbers(
@@ -77,14 +89,30 @@ def depths(program: Program, uv: Array, view: Array, curvature: Array | None = N
 
     A lookup lies at uv + depth * D(view), D as `step` gives it.
     """
-    del curvature  # the plane alone until a march bends its rays
-    found = program.depth
+    return marched(program, uv, view, curvature)[0]
+
+
+def marched(
+    program: Program, uv: Array, view: Array, curvature: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """Ray depth (b,) as `depths`, opacity (b,) and turn (b,) as `bent.Crossing` has them."""
+    found, dtype = program.depth, program.textures[0].levels[0].dtype
+    opacity, turn = np.ones(len(uv), dtype), np.zeros(len(uv), dtype)
     if found is None:
-        return np.zeros(len(uv), program.textures[0].levels[0].dtype)
-    if isinstance(found, Heights):
-        along = ray(view, program.aspect, found.scale)
-        met = crossing(found.heights, uv, along, wrap=program.wrap)
-        return met * lift(view) * found.scale
+        return np.zeros(len(uv), dtype), opacity, turn
+    if not isinstance(found, Heights):
+        return _network_depths(program, found, uv, view), opacity, turn
+    along = ray(view, program.aspect, found.scale)
+    met = crossing(found.heights, uv, along, wrap=program.wrap)
+    depth = met * lift(view) * found.scale
+    if found.curved and curvature is not None and (rows := np.flatnonzero(curvature)).size:
+        depth[rows], opacity[rows], _, turn[rows] = bent.meet(
+            found, uv[rows], view[rows], curvature[rows], aspect=program.aspect, wrap=program.wrap
+        )
+    return depth, opacity, turn
+
+
+def _network_depths(program: Program, found: DepthNetwork, uv: Array, view: Array) -> Array:
     psi = bilinear(found.texture.levels[0], uv, wrap=program.wrap)
     known = _known(view, view, None, None) | _columns(found.texture, psi)
     return _run(found.layers, found.inputs, known, rounded=program.rounded)[:, 0] * found.scale
@@ -98,6 +126,7 @@ def evaluate_plain(
     light: Array,
     view: Array,
     footprint: Array | None = None,
+    curvature: Array | None = None,
     *,
     raw: bool = False,
     networks: Networks = "float32",
@@ -108,13 +137,14 @@ def evaluate_plain(
         layout: the model. weights: (layout.weights,). texels: (layout.texels, 8).
         uv: (b, 2). light, view: (b, 3) unit vectors.
         footprint: (b,) texels of the data's grid; None is 0.5 throughout.
+        curvature: (b,) 1/tile width, of curved heights; None is the plane.
         networks: with "bfloat16" the weights and inputs of all layers but the first are rounded
             to it; products are summed as before.
     """
     program = layout.program(weights, texels, networks=networks)
     if raw:
-        return numbers(program, uv, light, view, footprint)
-    return answer(program, uv, light, view, footprint)[0]
+        return numbers(program, uv, light, view, footprint, curvature)
+    return answer(program, uv, light, view, footprint, curvature)[0]
 
 
 def depths_plain(
@@ -123,11 +153,12 @@ def depths_plain(
     texels: Array,
     uv: Array,
     view: Array,
+    curvature: Array | None = None,
     *,
     networks: Networks = "float32",
 ) -> Array:
     """The twin of `Kernel.depths`."""
-    return depths(layout.program(weights, texels, networks=networks), uv, view)
+    return depths(layout.program(weights, texels, networks=networks), uv, view, curvature)
 
 
 def released(yuv: Array, mask: Array) -> Array:
@@ -219,27 +250,6 @@ def on_disc(direction: Array) -> Array:
     return direction[..., :2] * (stretch * (2 / np.pi)).astype(direction.dtype)[..., None]
 
 
-def bilinear(texture: Array, uv: Array, *, wrap: bool) -> Array:
-    """(b, k) of a texture (h, w, k) at uv (b, 2), tiling or clamped at its borders."""
-    h, w, _ = texture.shape
-    size = np.asarray([w, h], uv.dtype)
-    if wrap:
-        uv = uv - np.floor(uv)
-    at = uv * size - np.asarray(0.5, uv.dtype)
-    at = np.clip(at, -1, size)
-    low = np.floor(at)
-    fx, fy = (at - low).T[..., None]
-    x0, y0 = low.astype(np.int64).T
-    if wrap:
-        x0, x1, y0, y1 = x0 % w, (x0 + 1) % w, y0 % h, (y0 + 1) % h
-    else:
-        x1, y1 = np.clip(x0 + 1, 0, w - 1), np.clip(y0 + 1, 0, h - 1)
-        x0, y0 = np.clip(x0, 0, w - 1), np.clip(y0, 0, h - 1)
-    upper = texture[y0, x0] * (1 - fx) + texture[y0, x1] * fx
-    lower = texture[y1, x0] * (1 - fx) + texture[y1, x1] * fx
-    return upper * (1 - fy) + lower * fy
-
-
 def _last_layer(
     program: Program,
     uv: Array,
@@ -247,16 +257,22 @@ def _last_layer(
     view: Array,
     footprint: Array | None,
     curvature: Array | None,
-) -> tuple[Array, Array | None]:
-    """The last layer's numbers, and what the scaling texture says there."""
+) -> tuple[Array, Array | None, tuple[Array, Array]]:
+    """The last layer's numbers, what the scaling texture says there, and the march's opacity.
+
+    With the opacity (b,) it says whether light comes from above where the ray ends, (b,).
+    """
+    depth, opacity, turn = marched(program, uv, view, curvature)
+    toward, away = step(view, program.aspect), step(light, program.aspect)
+    if turn.any():
+        light, view = (bent.turned(direction, view, turn) for direction in (light, view))
+        view[:, 2] = np.where(turn == 0, view[:, 2], np.maximum(view[:, 2], LOWEST_SEEN))
     known = _known(light, view, footprint if program.leveled else None, curvature)
-    depth = None if program.depth is None else depths(program, uv, view, curvature)
     every = [*program.textures, *([program.scaling] if program.scaling else [])]
     values = []
     for texture in every:
         moved = uv
-        if depth is not None and (texture.view or texture.light):
-            toward, away = step(view, program.aspect), step(light, program.aspect)
+        if program.depth is not None and (texture.view or texture.light):
             moved = uv + depth[:, None] * (texture.view * toward - texture.light * away)
         values.append(_between_levels(texture, moved, known["level"] * LEVELS_UNIT, program.wrap))
     for texture, found in zip(program.textures, values, strict=False):
@@ -267,7 +283,7 @@ def _last_layer(
         axis = values[0][:, 3 * k : 3 * k + 3]
         known |= {next(names): (axis * direction).sum(axis=1) for direction in (half, light)}
     raw = _run(program.layers, program.inputs, known, rounded=program.rounded)
-    return raw, values[-1] if program.scaling else None
+    return raw, values[-1] if program.scaling else None, (opacity, light[:, 2] > 0)
 
 
 def _heads(program: Program, raw: Array) -> dict[str, Array]:
@@ -288,10 +304,10 @@ def _known(light: Array, view: Array, footprint: Array | None, curvature: Array 
     level = np.zeros(len(light), light.dtype)
     if footprint is not None:
         level = np.log2(2 * np.clip(footprint, 0.5, 1e30))
-    bent = np.zeros(len(light), light.dtype) if curvature is None else curvature
+    curved = np.zeros(len(light), light.dtype) if curvature is None else bent.softened(curvature)
     found = dict(zip(("lx", "ly", "lz", "vx", "vy", "vz"), (*light.T, *view.T), strict=True))
     found |= dict(zip(("hx", "hy", "hz"), half.T, strict=True))
-    found |= {"cos_diff": cos_diff, "level": level / LEVELS_UNIT, "curvature": bent}
+    found |= {"cos_diff": cos_diff, "level": level / LEVELS_UNIT, "curvature": curved}
     found |= dict(zip(("lx_disc", "ly_disc"), on_disc(light).T, strict=True))
     return found | dict(zip(("vx_disc", "vy_disc"), on_disc(view).T, strict=True))
 

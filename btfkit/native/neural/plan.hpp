@@ -61,6 +61,7 @@ struct Mlp {
 
 struct Plan {
     bool wrap = true, offset = false;
+    bool curved = false;  // whether curvature bends rays through heights, which may pass them
     float aspect = 1, depth_scale = 1;
     int output = kLog, channels = 3;
     int frames = 0;  // vectors among the first features: the decoder takes their products with
@@ -98,7 +99,6 @@ inline void check(const Mlp& mlp) {
     for (int width : mlp.widths) require(width >= 1 && width <= 128, "layer widths are 1 to 128");
     for (int code : mlp.directions) {
         require(code >= 0 && code < kInputs, "unknown input");
-        require(code != kCurvature, "the kernels do not know the input curvature");
     }
     require(mlp.activation >= kLinear && mlp.activation <= kSine, "unknown activation");
     require(mlp.features() >= 1, "a network needs at least one feature");
@@ -119,6 +119,14 @@ inline void check(const Plan& plan) {
     };
     require(!(plan.offset && plan.heights.h), "depths from a network or from heights, not both");
     require(int64_t(plan.heights.h) * plan.heights.w < (int64_t(1) << 30), "2^30 heights or more");
+    require(!plan.curved || plan.heights.h > 0, "curvature bends rays through heights alone");
+    auto takes_curvature = [](const Mlp& m) {
+        return std::count(m.directions.begin(), m.directions.end(), int(kCurvature)) > 0;
+    };
+    require(plan.curved || !takes_curvature(plan.decoder),
+            "the input curvature is that of curved heights");
+    require(!plan.offset || !takes_curvature(plan.offset_mlp),
+            "the offset network knows no curvature");
     for (const auto& b : plan.banks) bank(b);
     require(plan.frames >= 0 && 3 * plan.frames <= plan.banks[0].channels,
             "a frame takes three channels of the first bank");
@@ -141,6 +149,7 @@ inline void check(const Plan& plan) {
 struct Batch {
     int64_t size = 0;
     const float *uv = nullptr, *light = nullptr, *view = nullptr, *footprint = nullptr;
+    const float *curvature = nullptr;  // 1 / tile width; null is the plane
     const float *target = nullptr, *weight = nullptr;
     float top = 0, bottom = 0;  // of the heights
 };

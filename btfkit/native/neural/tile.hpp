@@ -10,9 +10,11 @@ struct Tile {
     Features offset_features, features[kMaxBanks];
     Levels levels;
     // u v du_view dv_view du_light dv_light depth, of heights the ray, the crossing and its share
-    // of the depth, the gradient of the depth; and channels of one bank
+    // of the depth, the gradient of the depth, what curvature makes of a ray (the curvature a unit
+    // of heights, the opacity, what scatter_heights takes, the way's direction, the turn); and channels of one bank
     Rows in, slopes;
     Surface surface{};
+    bool bent = false, train_ = false;  // whether the batch has curvatures; whether it is learnt from
     alignas(64) float direction[kInputs][kTile];
     alignas(64) float position[2][kTile];
     alignas(64) float gather[kTile][kChannels];
@@ -21,11 +23,12 @@ struct Tile {
     int ahead = 0, now = 0;
     bool fetched = false;
     Feed feed;
-    enum { kU, kV, kHu, kHv, kLu, kLv, kDepth, kRayU, kRayV, kLift, kCross, kSlope, kInRows };
+    enum { kU, kV, kHu, kHv, kLu, kLv, kDepth, kRayU, kRayV, kLift, kCross, kSlope,
+           kBend, kOpaque, kClear, kLeast, kBackX, kBackY, kTurnSine, kTurnCosine, kInRows };
 
     NEUMIP_TARGET Tile(const Plan& p, const float* weights, const float* t, const Batch& b,
                        bool train)
-        : plan(p), texels(t) {
+        : plan(p), texels(t), train_(train) {
         surface = {t, float(p.heights.w), float(p.heights.h), b.top, b.bottom, p.wrap};
         decoder.pack(p.decoder, weights, train, p.half, p.pairs && L == 16);
         decoder_trace.reset(p.decoder, train);
@@ -103,14 +106,93 @@ struct Tile {
         }
     }
 
+    NEUMIP_TARGET void set_curvature(const float* curvature, int valid, int n) {
+        if (!plan.curved) return;
+        bent = curvature != nullptr;
+        std::fill(in[kOpaque], in[kOpaque] + n, 1.f);
+        if (!bent) {
+            std::memset(direction[kCurvature], 0, sizeof direction[kCurvature]);
+            return;
+        }
+        for (int i = 0; i < n; ++i) in[kBend][i] = curvature[i < valid ? i : valid - 1];
+        for (int i = 0; i < n; i += L) {
+            const F k = load(in[kBend] + i), size = k < all(0.f) ? -k : k;
+            store(direction[kCurvature] + i, k / (size + kCurvatureUnit));
+            store(in[kBend] + i, k * plan.depth_scale);
+        }
+    }
+
     // Ray depths where the view rays of queries from..from+n meet the heights.
     MEMBER void meet(int from, int n) {
         for (int i = from; i < from + n; i += L) {
-            const F z = surface.crossing(load(in[kU] + i), load(in[kV] + i), load(in[kRayU] + i),
-                                         load(in[kRayV] + i));
-            store(in[kCross] + i, z);
-            store(in[kDepth] + i, z * load(in[kLift] + i));
+            const I curved = bent ? load(in[kBend] + i) != all(0.f) : I{};
+            if (any_of(~curved)) {
+                const F z = surface.crossing(load(in[kU] + i), load(in[kV] + i),
+                                             load(in[kRayU] + i), load(in[kRayV] + i));
+                store(in[kCross] + i, z);
+                store(in[kDepth] + i, z * load(in[kLift] + i));
+                if (bent) {
+                    store(in[kTurnSine] + i, all(0.f));
+                    store(in[kTurnCosine] + i, all(1.f));
+                    store(in[kClear] + i, all(1.f));
+                    store(in[kLeast] + i, all(kFlattest));
+                }
+            }
+            if (any_of(curved)) meet_curved(i, curved);
         }
+    }
+
+    // Rows x, y, z of a direction into the frame where the rays end.
+    MEMBER void turn(float (*d)[kTile], int from, int n) {
+        for (int i = from; i < from + n; i += L) {
+            const F bx = load(in[kBackX] + i), by = load(in[kBackY] + i);
+            const F s = load(in[kTurnSine] + i), c = load(in[kTurnCosine] + i);
+            const F up = load(d[2] + i), along = load(d[0] + i) * bx + load(d[1] + i) * by;
+            const F shift = along * (c - 1.f) - up * s;
+            store(d[0] + i, load(d[0] + i) + shift * bx);
+            store(d[1] + i, load(d[1] + i) + shift * by);
+            store(d[2] + i, along * s + up * c);
+        }
+    }
+
+    // The view as the layers take it, once the rays are followed.
+    MEMBER void turn_view(int n) {
+        turn(direction + kVx, 0, n);
+        for (int i = 0; i < n; i += L) {
+            const F z = load(direction[kVz] + i);
+            const I turned = load(in[kTurnSine] + i) != all(0.f);
+            store(direction[kVz] + i, select(turned, larger(z, all(kLowestSeen)), z));
+        }
+    }
+
+    // The same of L queries on a curved surface; lanes outside `curved` stay as they are.
+    MEMBER void meet_curved(int i, I curved) {
+        auto put = [&](int row, F x) NEUMIP_TARGET {
+            store(in[row] + i, select(curved, x, load(in[row] + i)));
+        };
+        const F x = load(direction[kVx] + i), y = load(direction[kVy] + i);
+        const Ray r = ray_of(surface, x, y, load(direction[kVz] + i), load(in[kBend] + i));
+        const F part = -plan.depth_scale / larger(root(x * x + y * y), all(kLeastSine));
+        put(kRayU, x * part);
+        put(kRayV, y * part * -plan.aspect);
+        I opaque;
+        const F way = meet_bent(surface, r, load(in[kU] + i), load(in[kV] + i),
+                                load(in[kRayU] + i), load(in[kRayV] + i), opaque);
+        put(kCross, way);
+        put(kDepth, -way * r.share);
+        const F flat = -1.f / larger(root(x * x + y * y), all(kLeastSine));
+        store(in[kBackX] + i, x * flat);
+        store(in[kBackY] + i, y * flat);
+        const F half = r.bend * way * 0.5f, q = half * half, s = half * sinc_of(q);
+        put(kTurnSine, 2.f * s * cosine_of(q));
+        put(kTurnCosine, 1.f - 2.f * s * s);
+        put(kOpaque, select(opaque, all(1.f), all(0.f)));
+        if (!train_) return;
+        // Their way runs against that of the plane's rays, which rise.
+        const F fall = r.falling(way);
+        put(kClear, fall);
+        put(kLeast, kFlattest * larger(fall, all(kSteepest)));
+        put(kLift, r.share);
     }
 
     NEUMIP_TARGET void set_light(const float* light, int valid, int n, bool same) {
@@ -118,6 +200,7 @@ struct Tile {
             for (int c = 0; c < 3; ++c) std::fill(direction[kLx + c], direction[kLx + c] + n, light[c]);
         else vectors(direction, light, valid, n);
         if (plan.depth() && plan.needs_light()) step(direction, in[kLu], in[kLv], n);
+        if (bent) turn(direction, 0, n);
         if (!plan.needs_half()) return;
         for (int i = 0; i < n; i += L) {
             F h[3];
@@ -185,6 +268,7 @@ struct Tile {
             look_up_features(s, from, size, half, valid, false);
             if (half == 0) s.wish(half, s.texels);
         }
+        if (s.bent) s.turn_view(n);
     }
 
     DEEP void look_up_features(Tile& s, int from, int size, int half, int valid, bool lights) {
@@ -268,8 +352,22 @@ struct Tile {
         const int n = padded(valid);
         set_position(b.uv + 2 * at, b.footprint ? b.footprint + at : nullptr, valid, n);
         set_view(b.view + 3 * at, valid, n);
+        set_curvature(b.curvature ? b.curvature + at : nullptr, valid, n);
         find_features<false>(*this, b, at, valid, n);
         fetched = false;
+    }
+
+    // 1 where rays meet curved heights, and light comes from above there; else 0.
+    MEMBER F seen_and_lit(int i) {
+        const F lit = load(direction[kLz] + i);
+        return select(lit > all(0.f), load(in[kOpaque] + i), all(0.f));
+    }
+
+    // Whether any ray of the tile meets the heights.
+    bool seen(int valid) const {
+        if (!bent) return true;
+        const float* opaque = in.base + size_t(kOpaque) * kStride;
+        return std::any_of(opaque, opaque + valid, [](float x) { return x > 0; });
     }
 
     // Writes (valid, outputs) reflectance; stage_one has run for these queries.
@@ -298,7 +396,8 @@ struct Tile {
             for (int c = 0; c < outputs; ++c)
                 for (int i = 0; i < n; i += L) {
                     const F y = smaller(larger(answer(c, i), all(0.f)), all(kMostLog));
-                    store(z[c] + i, exp_of(y) - 1.f);
+                    const F value = exp_of(y) - 1.f;
+                    store(z[c] + i, plan.curved ? value * seen_and_lit(i) : value);
                 }
         if (outputs == 3) {
             const float *r = z[0], *g = z[1], *bl = z[2];

@@ -6,6 +6,7 @@
 #include "networks.hpp"
 #include "lookup.hpp"
 #include "march.hpp"
+#include "bent.hpp"
 #include "tile.hpp"
 #include "backward.hpp"
 #include "entries.hpp"

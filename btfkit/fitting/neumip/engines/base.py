@@ -10,7 +10,7 @@ from typing import Generic, TypeVar, final
 from torch import Tensor
 
 from btfkit.fitting.neumip.data import Batch
-from btfkit.materials.neumip.material import NeuMIP
+from btfkit.materials.neumip.material import NeuMIPMaterial
 from btfkit.native.neural.layout import Array
 
 # Names of what is trained, and of the moments that Adam keeps of each.
@@ -96,7 +96,8 @@ class Engine(ABC, Generic[B]):
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Take back what `state` gave."""
 
-    def answers(self, material: NeuMIP, held: Batch) -> Array:
+    def answers(self, material: NeuMIPMaterial, held: Batch) -> Array:
         """Reflectance (b, c) of a material for the held-out queries."""
         blur = 0.5 if held.footprint is None else held.footprint
-        return material.evaluate(held.uv, held.light, held.view, blur).reflectance
+        bend = 0.0 if held.curvature is None else held.curvature
+        return material.evaluate(held.uv, held.light, held.view, blur, bend).reflectance

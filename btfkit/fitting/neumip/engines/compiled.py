@@ -83,7 +83,7 @@ class Compiled(Engine[Batch]):
     def _gradients(self, batch: Batch) -> float:
         loss, _ = self._kernel.train(
             *self.parameters(), batch.uv, batch.light, batch.view, batch.footprint, batch.target,
-            batch.weight, loss=self._loss,
+            batch.weight, loss=self._loss, curvature=batch.curvature,
         )  # fmt: skip
         return loss
 

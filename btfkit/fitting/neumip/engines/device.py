@@ -144,7 +144,7 @@ class OnDevice(Engine[DeviceBatch]):
         for name, tensor in self._tensors.items():
             tensor.copy_(state[name])
 
-    def answers(self, material: evaluated.NeuMIP, held: Batch) -> Array:
+    def answers(self, material: evaluated.NeuMIPMaterial, held: Batch) -> Array:
         return evaluate_on_device(
             material, held.uv, held.light, held.view, held.footprint,
             device=self.device, matrix=self._matrix,
@@ -195,7 +195,7 @@ def _laplacian(texture: Tensor, axis: int, *, wrap: bool) -> Tensor:
 
 
 def evaluate_on_device(
-    material: evaluated.NeuMIP,
+    material: evaluated.NeuMIPMaterial,
     uv: Array,
     light: Array,
     view: Array,

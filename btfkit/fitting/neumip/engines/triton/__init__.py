@@ -37,6 +37,8 @@ def available() -> bool:
 
 def uncovered(layout: Layout) -> str:
     """Why the kernels do not know a layout; empty where they do."""
+    if layout.curved:
+        return "heights on curved surfaces"
     networks = [layout.decoder] + ([layout.offset[1]] if layout.offset else [])
     for network in networks:
         hidden = network.widths[1:-1]

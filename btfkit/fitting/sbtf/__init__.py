@@ -1,0 +1,1 @@
+"""SBTF while it is fitted: NeuMIP's training, on curved surfaces too."""

@@ -1,0 +1,90 @@
+"""SBTF as it is used: rays that curvature bends meet a texture of heights, or pass it.
+
+What NeuMIP answers on the plane is answered on curved surfaces: opacity and the place that is seen
+come from geometry, exactly on a cylinder. Layers take light and view in the frame where the ray
+meets the heights, so that what was learnt on the plane is right there, and the curvature where it
+was learnt.
+
+Source: Kuznetsov et al., "Rendering Neural Materials on Curved Surfaces", 2022, whose networks of
+opacity and offset the march replaces.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any, ClassVar, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit.conventions import MOST_BEND
+from btfkit.materials.base import Array, Header
+from btfkit.materials.neumip.material import NeuMIPMaterial
+from btfkit.materials.neumip.spec import NeuMIPSpec
+from btfkit.native.neural import plain
+from btfkit.queries import Query
+
+
+@final
+class SBTF(NeuMIPMaterial):
+    """NeuMIP with silhouettes, on planes and under curved surfaces.
+
+    Attributes:
+        sharpest: (concave, convex) curvature, 1/tile width, beyond which heights would reach the
+            axis of curvature; infinite where none would. What bends more is answered as these,
+            and a warning says so once.
+    """
+
+    model: ClassVar[str] = "sbtf"
+    has_curvature: ClassVar[bool] = True
+    full_sphere: ClassVar[bool] = True
+
+    def __init__(self, spec: NeuMIPSpec, weights: Mapping[str, NDArray[Any]], header: Header):
+        if not (spec.heights and spec.curved):
+            raise ValueError(
+                f"heights = {spec.heights}, curved = {spec.curved}; an sbtf has curved heights"
+            )
+        super().__init__(spec, weights, header)
+        heights = self.layout.surface(self.texels) * spec.depth_scale
+        top, bottom = max(float(heights.max()), 0.0), min(float(heights.min()), 0.0)
+        self.sharpest = (
+            -MOST_BEND / top if top else -np.inf,
+            MOST_BEND / -bottom if bottom else np.inf,
+        )
+
+    def _answer(self, query: Query) -> tuple[Array, Array | None]:
+        bend, footprint = self._bend(query), self._footprint(query)
+        parts = (query.uv, query.light, query.view, footprint, bend)
+        if self._kernel is None:
+            answer, opacity = plain.answer(self._program, *parts)
+        else:
+            opacity = np.empty(len(query.uv), np.float32)
+            answer = self._kernel.evaluate(self.flat, self.texels, *parts, opacity=opacity)
+        return answer.astype(np.float32, copy=False), opacity.astype(np.float32, copy=False)
+
+    def _answer_lights(self, query: Query) -> tuple[Array, Array | None]:
+        assert self._kernel is not None
+        bend, opacity = self._bend(query), np.empty(len(query.uv), np.float32)
+        parts = (query.uv, query.light, query.view, self._footprint(query), bend)
+        answer = self._kernel.evaluate_lights(self.flat, self.texels, *parts, opacity=opacity)
+        return answer, opacity
+
+    def _bend(self, query: Query) -> Array | None:
+        """Curvature (b,); None, which the plane's rays take, where there is none."""
+        if not np.any(query.curvature):
+            return None
+        low, high = self.sharpest
+        self._warn_of_sharp(query.curvature, low, high)
+        return np.ascontiguousarray(np.clip(query.curvature, low, high), np.float32)
+
+    def _warn_of_sharp(self, curvature: Array, low: float, high: float) -> None:
+        ends = float(curvature.min()), float(curvature.max())
+        if (ends[0] < low or ends[1] > high) and "sharp" not in self._warned:
+            self._warned.add("sharp")
+            worst, most = (ends[1], high) if ends[1] > high else (ends[0], low)
+            warnings.warn(
+                f"a curvature of {worst:g} / tile bends heights to their axis; "
+                f"{most:g} / tile is answered there. Use larger tiles on the shape",
+                stacklevel=5,
+            )

@@ -1,0 +1,153 @@
+// View rays through heights on a curved surface: included after march.hpp, once a variant. The
+// formulas and what the names mean: bent.py, whose twin this is. Lengths in units of the heights.
+
+// asin(x) / x of x x, |x| <= 1: least squares on Chebyshev nodes to 1e-8 up to 1/2, and beyond
+// asin x = pi/2 - 2 asin sqrt((1 - x) / 2).
+FN F arc_of(F q) {
+    F p = all(0.0425535999f);
+    p = p * q + 0.0239093639f;
+    p = p * q + 0.0455390103f;
+    p = p * q + 0.0749453455f;
+    p = p * q + 0.166666667f;
+    return p * q + 1.f;
+}
+FN F arc_over_sine(F x) {
+    const F size = smaller(x < all(0.f) ? -x : x, all(1.f));
+    const F half = (1.f - size) * 0.5f, side = root(half);
+    const F wide = (1.57079632679f - 2.f * side * arc_of(half)) / larger(size, all(0.5f));
+    return select(size > all(0.5f), wide, arc_of(size * size));
+}
+// sin(x) / x and cos(x) for |x| <= pi/2, of x x: as above, to 2e-8.
+FN F sinc_of(F q) {
+    F p = all(-2.38893847e-8f);
+    p = p * q + 2.75252819e-6f;
+    p = p * q - 1.98408612e-4f;
+    p = p * q + 8.33333097e-3f;
+    p = p * q - 0.166666667f;
+    return p * q + 1.f;
+}
+FN F cosine_of(F q) {
+    F p = all(1.99075889e-9f);
+    p = p * q - 2.75246776e-7f;
+    p = p * q + 2.48010401e-5f;
+    p = p * q - 1.38888846e-3f;
+    p = p * q + 4.16666679e-2f;
+    p = p * q - 0.5f;
+    return p * q + 1.f;
+}
+
+constexpr float kLeastSine = 1e-6f, kLeastBend = 1e-9f, kLeastDepth = 1e-6f;
+
+struct Ray {
+    F bend, sine, cosine, share, start, stop;
+    I reaches;
+
+    MEMBER F way_to(float height) const {
+        const F lift = bend * height;
+        const F square = cosine * cosine + lift * (2.f + lift);
+        const F side = root(larger(square, all(0.f)));
+        const F there = -height * (2.f + lift) * sine /
+                        ((1.f + lift) * larger(cosine + side, all(1e-9f)));
+        const I missed = square < all(0.f);
+        const F straight = select(missed, cosine / select(missed, bend, all(1.f)), there);
+        return straight * arc_over_sine(bend * straight);
+    }
+    MEMBER F height_at(F way) const {
+        const F half = bend * way * 0.5f, q = half * half;
+        const F c = cosine_of(q), sinc = sinc_of(q), s = half * sinc;
+        const F middle = cosine * c - sine * s;
+        const F end = sine * (c * c - s * s) + cosine * (2.f * s * c);
+        return -way * sinc * middle / larger(end, all(1e-9f));
+    }
+    // How fast the ray falls towards the surface there: -dz/ds.
+    MEMBER F falling(F way) const {
+        const F half = bend * way * 0.5f, q = half * half;
+        const F c = cosine_of(q), s = half * sinc_of(q);
+        const F c2 = c * c - s * s, s2 = 2.f * s * c;
+        const F at = cosine * c2 - sine * s2, end = sine * c2 + cosine * s2;
+        return (1.f + bend * height_at(way)) * at / larger(end, all(1e-9f));
+    }
+};
+
+// x, y, z: of the view; k: curvature a unit of heights.
+FN Ray ray_of(const Surface& s, F x, F y, F z, F k) {
+    const float top = s.top > 0.f ? s.top : 0.f, bottom = s.bottom < 0.f ? s.bottom : 0.f;
+    const float least = -kMostBend / (top > kLeastDepth ? top : kLeastDepth);
+    const float most = kMostBend / (-bottom > kLeastDepth ? -bottom : kLeastDepth);
+    Ray r;
+    const F size = k < all(0.f) ? -k : k;
+    r.bend = select(size < all(kLeastBend), all(0.f), smaller(larger(k, all(least)), all(most)));
+    const F flat = larger(root(x * x + y * y), all(kLeastSine));
+    const F lift = r.bend * bottom;
+    r.reaches = z * z + lift * (2.f + lift) >= all(0.f);
+    r.cosine = select(r.reaches, larger(z, all(kSteepest)), z);
+    const F part = 1.f / root(flat * flat + r.cosine * r.cosine);
+    r.sine = flat * part;
+    r.cosine = r.cosine * part;
+    r.share = larger(z, all(kLowestCosine)) / flat;
+    r.start = r.way_to(top);
+    const F turn = smaller(r.cosine, all(1.f));
+    const F leaves = 2.f * turn * arc_over_sine(turn) / select(r.reaches, all(1.f), r.bend);
+    r.stop = select(r.reaches, r.way_to(bottom), leaves - r.start);
+    return r;
+}
+
+// Share of the way from a gap above the surface to one below it at which there is none.
+FN F between(F gap, F under) {
+    const F share = gap / larger(gap - under, all(1e-12f));
+    return smaller(larger(share, all(0.f)), all(1.f));
+}
+
+// Way over the surface where rays first meet it; `opaque` tells those that do. (du, dv) is the
+// step in uv of a unit of way.
+FN F meet_bent(const Surface& surface, const Ray& r, F u, F v, F du, F dv, I& opaque) {
+    const F size_u = du < all(0.f) ? -du : du, size_v = dv < all(0.f) ? -dv : dv;
+    const F length = r.stop - r.start;
+    const F texels = larger(size_u * surface.w, size_v * surface.h) * length *
+                     select(r.reaches, all(1.f), all(kCurvedFiner));
+    const F looks = select(r.reaches, all(float(kLooks)), all(float(kCurvedLooks)));
+    const F count = smaller(larger(-floor_of(-texels), all(1.f)), looks);
+    const F step = length / count;
+    // From look to look the angle turns by twice `half`.
+    const F half = r.bend * step * 0.5f, q = half * half;
+    const F c1 = cosine_of(q), sinc = sinc_of(q), s1 = half * sinc;
+    const F c2 = c1 * c1 - s1 * s1, s2 = 2.f * s1 * c1;
+    const F fall = step * sinc;
+    F sine, cosine, drop;  // of the angle at the last look; its height times that sine
+    {
+        const F begun = r.bend * r.start * 0.5f, p = begun * begun;
+        const F c = cosine_of(p), part = sinc_of(p), s = begun * part;
+        drop = -r.start * part * (r.cosine * c - r.sine * s);
+        const F cc = c * c - s * s, ss = 2.f * s * c;
+        sine = r.sine * cc + r.cosine * ss;
+        cosine = r.cosine * cc - r.sine * ss;
+    }
+    F high = r.start, low = high;
+    F gap = drop / larger(sine, all(1e-9f)) - surface.at(u + high * du, v + high * dv);
+    F under = gap;
+    I going = ~I{};
+    for (int k = 1; k <= kCurvedLooks; ++k) {
+        high = select(going, low, high);
+        gap = select(going, under, gap);
+        drop -= fall * (cosine * c1 - sine * s1);
+        const F turned = sine * c2 + cosine * s2;
+        cosine = cosine * c2 - sine * s2;
+        sine = turned;
+        const F to = r.start + step * float(k);
+        const F rest = drop / larger(sine, all(1e-9f)) - surface.at(u + to * du, v + to * dv);
+        low = select(going, to, low);
+        under = select(going, rest, under);
+        going &= (rest > all(0.f)) & (float(k) < count);
+        if (!any_of(going)) break;
+    }
+    opaque = r.reaches | (under <= all(0.f));
+    const F met = high + (low - high) * between(gap, under);
+    const F rest = r.height_at(met) - surface.at(u + met * du, v + met * dv);
+    const I above = rest > all(0.f);
+    high = select(above, met, high);
+    gap = select(above, rest, gap);
+    low = select(above, low, met);
+    under = select(above, under, rest);
+    const F way = high + (low - high) * between(gap, under);
+    return select(opaque, way, r.stop);
+}

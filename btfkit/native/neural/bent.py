@@ -1,0 +1,211 @@
+"""View rays through heights on a curved surface: the twin of bent.hpp.
+
+The surface is a cylinder of curvature k along the projected ray, the ray straight. It enters the
+surface at angle t from the normal; s is its way over the surface behind the entry, z its height
+over the surface. The triangle of axis, entry and a point of the ray has (1 + k z) sin(t + k s) =
+sin t, which is
+
+    z sin(t + k s) = -s sinc(k s / 2) cos(t + k s / 2),  sinc x = sin(x) / x
+
+without cancellation for either sign of k, and for k = 0 the plane's z = -s cot t. All lengths are
+in units of the heights.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit.conventions import (
+    CURVATURE_UNIT,
+    CURVED_FINER,
+    CURVED_LOOKS,
+    FLATTEST,
+    LOOKS,
+    LOWEST_COSINE,
+    MOST_BEND,
+    STEEPEST,
+    displacement,
+)
+from btfkit.native.neural.lookup import bilinear
+from btfkit.program import Heights
+
+Array = NDArray[Any]
+# Sines of view rays begin here: straight down, the way over the surface would be 0 throughout.
+_LEAST_SINE = 1e-6
+# Bends below this are 0, those of a plane.
+_LEAST_BEND = 1e-9
+# Depths and heights, units, that a bend is never compared with less than.
+_LEAST_DEPTH = 1e-6
+
+
+class Rays(NamedTuple):
+    """b view rays at a curved surface.
+
+    Attributes:
+        bend: (b,) curvature times a unit of heights.
+        sine, cosine: (b,) of the angle at the entry; of rays that reach the bottom the cosine is
+            STEEPEST or more.
+        along: (b, 2) in uv for a unit of way over the surface.
+        share: (b,) ray depth of a unit of way, as `plain.step` counts it.
+        start, stop: (b,) way where the march begins and ends.
+        reaches: (b,) whether the ray reaches the bottom: it cannot pass.
+    """
+
+    bend: Array
+    sine: Array
+    cosine: Array
+    along: Array
+    share: Array
+    start: Array
+    stop: Array
+    reaches: Array
+
+
+class Crossing(NamedTuple):
+    """Where b rays first meet the heights.
+
+    Attributes:
+        depth: (b,) ray depth, tile widths, as `plain.depths`.
+        opacity: (b,) 1 where they do, 0 where they pass; there the depth is that of the end.
+        way: (b,) over the surface, units of heights.
+        turn: (b,) angle at the axis between the entry and there, radians.
+    """
+
+    depth: Array
+    opacity: Array
+    way: Array
+    turn: Array
+
+
+def meet(
+    found: Heights, uv: Array, view: Array, curvature: Array, *, aspect: float, wrap: bool
+) -> Crossing:
+    """Where view rays first meet heights on a curved surface.
+
+    A ray that reaches the bottom is looked at a texel apart, or at LOOKS places where it is longer;
+    one that may leave again CURVED_FINER times as often, or at CURVED_LOOKS places. Between two
+    of them the surface is taken as straight, twice.
+
+    Args:
+        found: the heights. uv: (b, 2). view: (b, 3). curvature: (b,) 1/tile width.
+    """
+    heights = found.heights
+    h, w = heights.shape
+    rays = rays_of(found, view, curvature, aspect)
+    surface = heights[..., None]
+
+    def above(way: Array) -> Array:
+        under = bilinear(surface, uv + way[:, None] * rays.along, wrap=wrap)[:, 0]
+        return height_at(rays, way) - under
+
+    def met(high: Array, low: Array, gap: Array, under: Array) -> Array:
+        return high + (low - high) * np.clip(gap / np.maximum(gap - under, 1e-12), 0, 1)
+
+    length = rays.stop - rays.start
+    texels = length * np.max(np.abs(rays.along) * [w, h], axis=1)
+    texels = texels * np.where(rays.reaches, 1, CURVED_FINER)
+    count = np.clip(np.ceil(texels), 1, np.where(rays.reaches, LOOKS, CURVED_LOOKS))
+    low = high = rays.start
+    under = gap = above(low)
+    going = np.ones(len(uv), bool)
+    for k in range(1, CURVED_LOOKS + 1):
+        high, gap = np.where(going, low, high), np.where(going, under, gap)
+        to = rays.start + length * np.minimum(k / count, 1).astype(length.dtype)
+        rest = above(to)
+        low, under = np.where(going, to, low), np.where(going, rest, under)
+        going &= (rest > 0) & (k < count)
+    opaque = rays.reaches | (under <= 0)
+    first = met(high, low, gap, under)
+    rest = above(first)
+    short = rest > 0
+    high, gap = np.where(short, first, high), np.where(short, rest, gap)
+    low, under = np.where(short, low, first), np.where(short, under, rest)
+    way = met(high, low, gap, under)
+    way = np.where(opaque, way, rays.stop)
+    depth = -way * rays.share * np.asarray(found.scale, way.dtype)
+    return Crossing(depth, opaque.astype(way.dtype), way, rays.bend * way)
+
+
+def rays_of(found: Heights, view: Array, curvature: Array, aspect: float) -> Rays:
+    """The rays of some views (b, 3) under curvatures (b,), 1/tile width."""
+    top, bottom = max(float(found.heights.max()), 0.0), min(float(found.heights.min()), 0.0)
+    bend = limited(curvature * found.scale, top, bottom).astype(view.dtype)
+    z, square = view[:, 2], view[:, 0] ** 2 + view[:, 1] ** 2
+    flat = np.maximum(np.sqrt(square), _LEAST_SINE)
+    reaches = z**2 + bend * bottom * (2 + bend * bottom) >= 0
+    cosine = np.where(reaches, np.maximum(z, STEEPEST), z)
+    length = np.hypot(flat, cosine)
+    sine, cosine = flat / length, cosine / length
+    start = _way_to(top, bend, sine, cosine)
+    leaves = 2 * np.arcsin(np.minimum(cosine, 1)) / np.where(reaches, 1, bend) - start
+    stop = np.where(reaches, _way_to(bottom, bend, sine, cosine), leaves)
+    moves = displacement(-view[:, 0], -view[:, 1], flat / found.scale, aspect)
+    share = np.maximum(z, LOWEST_COSINE) / flat
+    return Rays(bend, sine, cosine, np.stack(moves, axis=1), share, start, stop, reaches)
+
+
+def limited(bend: Array, top: float, bottom: float) -> Array:
+    """Curvature, per unit of heights, at which no height reaches the axis: MOST_BEND at most."""
+    least = -MOST_BEND / max(top, _LEAST_DEPTH)
+    most = MOST_BEND / max(-bottom, _LEAST_DEPTH)
+    return np.where(np.abs(bend) < _LEAST_BEND, 0, np.clip(bend, least, most))
+
+
+def height_at(rays: Rays, way: Array) -> Array:
+    """Height (b,) of rays where their way over the surface is `way` (b,)."""
+    half = rays.bend * way / 2
+    sine, cosine = np.sin(half), np.cos(half)
+    sinc = np.where(np.abs(half) < 1e-4, 1, sine / np.where(np.abs(half) < 1e-4, 1, half))
+    middle = rays.cosine * cosine - rays.sine * sine
+    end = rays.sine * (cosine**2 - sine**2) + rays.cosine * 2 * sine * cosine
+    return -way * sinc * middle / np.maximum(end, 1e-9)
+
+
+def falling(rays: Rays, way: Array) -> Array:
+    """How fast (b,) rays fall towards the surface there: -dz/ds."""
+    angle = np.arctan2(rays.sine, rays.cosine) + rays.bend * way
+    height = height_at(rays, way)
+    return (1 + rays.bend * height) * np.cos(angle) / np.maximum(np.sin(angle), 1e-9)
+
+
+def clearance(rays: Rays, way: Array, climb: Array) -> Array:
+    """How fast (b,) rays and heights approach; where they graze, no slower than FLATTEST allows.
+
+    A height moves the crossing by -1 / clearance of way.
+
+    Args:
+        climb: (b,) slope of the heights along the way.
+    """
+    fall = falling(rays, way)
+    return np.maximum(fall + climb, FLATTEST * np.maximum(fall, STEEPEST))
+
+
+def turned(direction: Array, view: Array, turn: Array) -> Array:
+    """Directions (b, 3) at the entry of views (b, 3), in the frame where the turned ray is."""
+    back = -view[:, :2] / np.maximum(np.hypot(view[:, 0], view[:, 1]), _LEAST_SINE)[:, None]
+    sine, cosine = np.sin(turn), np.cos(turn)
+    along, up = (direction[:, :2] * back).sum(axis=1), direction[:, 2]
+    shift = along * (cosine - 1) - up * sine
+    flat = direction[:, :2] + shift[:, None] * back
+    return np.column_stack([flat, along * sine + up * cosine]).astype(direction.dtype)
+
+
+def softened(curvature: Array) -> Array:
+    """A curvature (b,), 1/tile width, as layers take it: -1 to 1."""
+    return curvature / (CURVATURE_UNIT + np.abs(curvature))
+
+
+def _way_to(height: float, bend: Array, sine: Array, cosine: Array) -> Array:
+    """Way (b,) to a height; where a ray does not reach it, to where it is nearest."""
+    lift = bend * height
+    square = cosine**2 + lift * (2 + lift)
+    root = np.sqrt(np.maximum(square, 0))
+    straight = -height * (2 + lift) * sine / ((1 + lift) * np.maximum(cosine + root, 1e-9))
+    # The sine of the angle from the entry to where the ray is nearest is the cosine at the entry.
+    straight = np.where(square < 0, cosine / np.where(square < 0, bend, 1), straight)
+    turn = np.clip(bend * straight, -1, 1)
+    small = np.abs(turn) < 1e-4
+    return straight * np.where(small, 1, np.arcsin(turn) / np.where(small, 1, turn))

@@ -1,0 +1,245 @@
+"""SBTF: silhouettes from geometry, colours on curved surfaces, and what it says of bad input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import btfkit
+from btfkit import metrics
+from btfkit.errors import FitError
+from btfkit.fitting.fit import fit
+from btfkit.fitting.sbtf.tracing import queries_of
+from btfkit.materials.base import Header, Material
+from btfkit.materials.neumip.arrays import aligned, name_arrays
+from btfkit.materials.neumip.material import NeuMIP
+from btfkit.materials.neumip.spec import NeuMIPSpec
+from btfkit.materials.sbtf.material import SBTF
+from btfkit.queries import Query
+from btfkit.relief import procedural
+from btfkit.relief.material import TracedRelief
+from btfkit.relief.relief import Relief
+from btfkit.relief.trace import random_queries, trace
+from btfkit.render.preview import Scene, render
+from btfkit.shapes.catalogue import shape_of
+
+SIZE = 24
+
+
+@cache
+def relief() -> Relief:
+    return procedural.make("cobbles", SIZE, relief_texels=2.5).under_surface()[0]
+
+
+@cache
+def known() -> Material:
+    settings = {"levels": 1, "batch": 2048}
+    return fit(relief(), model="sbtf", steps=600, settings=settings, device="cpu").material
+
+
+def on_cylinders(count: int = 4000, *, bends: tuple[float, float] = (0.05, 0.85)) -> Query:
+    rng = np.random.default_rng(1)
+    z, angle = rng.uniform(0.03, 1, count), rng.uniform(0, 2 * np.pi, count)
+    flat = np.sqrt(1 - z**2)
+    view = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1).astype(np.float32)
+    light = rng.normal(size=(count, 3)).astype(np.float32)
+    light /= np.linalg.norm(light, axis=1, keepdims=True)
+    bend = np.exp(rng.uniform(*np.log(bends), count)) / -float(relief().height.min())
+    sharp = np.full(count, 0.5, np.float32)
+    return Query(rng.random((count, 2), np.float32), light, view, sharp, bend.astype(np.float32))
+
+
+def random_sbtf(heights: np.ndarray, **changes) -> SBTF:
+    """Random weights over given heights, tile widths."""
+    spec = NeuMIPSpec(heights.shape, offset=0, heights=True, curved=True, **changes)
+    header, rng = Header(grid=heights.shape), np.random.default_rng(2)
+    case = spec.layout(header)
+    weights = (0.3 * rng.standard_normal(case.weights)).astype(np.float32)
+    texels = aligned(case.texels)
+    texels[:] = rng.standard_normal(texels.shape)
+    case.surface(texels)[:] = heights / spec.depth_scale
+    return SBTF(spec, name_arrays(spec, case, weights, texels), header)
+
+
+@pytest.mark.slow
+def test_a_known_relief_gives_its_own_heights_and_silhouettes() -> None:
+    material, query = known(), on_cylinders()
+    assert isinstance(material, SBTF)
+    heights = material.layout.surface(material.texels) * material.spec.depth_scale
+    # Half floats of units of 0.05.
+    np.testing.assert_allclose(heights, relief().height, atol=1e-4)
+    truth = trace(relief(), query._replace(footprint=0 * query.footprint), samples=1)
+    rgb, opacity = material.evaluate(*query)
+    assert metrics.iou(opacity, truth.opacity) > 0.98
+    assert metrics.iou(np.ones(len(rgb)), truth.opacity) < 0.85
+    seen = truth.opacity > 0
+    lit = seen & (query.light[:, 2] < 0)
+    # Light from under the horizon reaches what is seen further round, and never on the plane.
+    assert truth.rgb[lit].max() > 0.1
+    assert rgb[lit].max() > 0.05
+    assert not material.evaluate(*query._replace(curvature=np.zeros(1))).reflectance[lit].any()
+    assert np.square(rgb - truth.rgb)[seen].mean() < 0.35 * truth.rgb[seen].var()
+
+
+@pytest.mark.slow
+def test_colours_on_curved_surfaces_beat_those_of_a_flat_model() -> None:
+    query = on_cylinders()
+    truth = trace(relief(), query, samples=8)
+    plane = random_queries(relief(), 200 * SIZE**2, seed=3, samples=4)
+    settings = {"levels": 1, "batch": 2048}
+    flat, found = (
+        fit(plane, model=model, steps=2000, settings=settings, device="cpu").material
+        for model in ("neumip", "sbtf")
+    )
+    plane_alone = flat.evaluate(*query._replace(curvature=np.zeros(1))).reflectance
+    bent = [found.evaluate(*query), known().evaluate(*query)]
+    seen = (truth.opacity > 0.5) & (bent[0].opacity > 0) & (bent[1].opacity > 0)
+
+    def error(answer: np.ndarray) -> float:
+        return float(np.square(answer - truth.rgb)[seen].mean())
+
+    for response in bent:
+        assert error(response.reflectance) < 0.95 * error(plane_alone)
+    assert metrics.iou(bent[0].opacity, truth.opacity > 0.5) > 0.88
+    assert metrics.iou(np.ones(len(query.uv)), truth.opacity > 0.5) < 0.7
+    # On the plane it is the same model, learnt in the same steps.
+    same = [m.evaluate(plane.uv, plane.light, plane.view).reflectance for m in (flat, found)]
+    np.testing.assert_array_equal(*same)
+
+
+def test_on_the_plane_an_sbtf_is_the_neumip_of_its_arrays() -> None:
+    material = random_sbtf(relief().height)
+    spec = replace(material.spec, curved=False)
+    flat, query = NeuMIP(spec, material.weights, material.header), on_cylinders(1000)
+    query = query._replace(curvature=np.zeros(1))
+    for found, wanted in zip(material.evaluate(*query), flat.evaluate(*query), strict=True):
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_a_query_file_with_curvature_is_fitted_and_evaluated_by_auto(tmp_path) -> None:
+    queries = queries_of(relief(), seed=5).subset(slice(4000))
+    report = fit(queries, steps=20, settings={"batch": 512}, out=tmp_path / "a.safetensors")
+    assert report.material.model == "sbtf"
+    assert 0 < report.errors["iou"] <= 1
+    assert report.material.spec.directions[-1] == "curvature"
+    again, query = btfkit.load(tmp_path / "a.safetensors"), on_cylinders(300)
+    for found, wanted in zip(again.evaluate(*query), report.material.evaluate(*query), strict=True):
+        np.testing.assert_array_equal(found, wanted)
+    plain = fit(queries, model="sbtf", steps=2, settings={"batch": 512, "curvature": False})
+    assert "curvature" not in plain.material.spec.directions
+
+
+def test_heights_that_are_said_to_be_given_need_a_relief() -> None:
+    queries = random_queries(relief(), 2000, seed=6)
+    with pytest.raises(FitError, match="heights=given, and the source is no relief"):
+        fit(queries, model="sbtf", steps=1, settings={"heights": "given"})
+    with pytest.raises(ValueError, match="expected one of auto, found, given"):
+        fit(queries, model="sbtf", steps=1, settings={"heights": "guessed"})
+    found = fit(relief(), model="sbtf", steps=1, settings={"heights": "found", "levels": 1})
+    assert not np.allclose(
+        found.material.layout.surface(found.material.texels) * 0.05, relief().height, atol=1e-3
+    )
+
+
+def test_given_heights_fit_textures_of_another_size() -> None:
+    half = fit(relief(), model="sbtf", steps=1, settings={"size": SIZE // 2, "levels": 1}).material
+    heights = half.layout.surface(half.texels) * half.spec.depth_scale
+    blocks = relief().height.reshape(SIZE // 2, 2, SIZE // 2, 2).mean(axis=(1, 3))
+    np.testing.assert_allclose(heights, blocks, atol=1e-4)
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_what_passes_answers_nothing_with_the_kernel_and_without(plain, monkeypatch) -> None:
+    if plain:
+        monkeypatch.setenv("BTFKIT_PLAIN", "1")
+    material, query = random_sbtf(relief().height), on_cylinders(1500)
+    rgb, opacity = material.evaluate(*query)
+    assert set(np.unique(opacity)) == {0.0, 1.0}
+    assert not rgb[opacity == 0].any()
+    lights = query.light[:3, None]
+    shared = material.evaluate(query.uv, lights, query.view, 0.5, query.curvature)
+    for k in range(3):
+        alone = material.evaluate(query.uv, lights[k], query.view, 0.5, query.curvature)
+        np.testing.assert_allclose(shared.reflectance[k], alone.reflectance, rtol=1e-4, atol=1e-5)
+        np.testing.assert_array_equal(shared.opacity[k], alone.opacity)
+
+
+def test_group_6_curvature_that_is_no_number_is_masked_and_too_sharp_a_one_is_named() -> None:
+    material, one = random_sbtf(relief().height), [0.0, 0.6, 0.8]
+    bad = np.array([np.nan, np.inf, -np.inf, 1.0, -1.0, 0.0, -1e6])
+    with pytest.warns(UserWarning, match="3 of 7 queries are not finite"):
+        rgb, opacity = material.evaluate([0.3, 0.2], one, one, 0.5, bad)
+    assert not rgb[:3].any()
+    np.testing.assert_array_equal(opacity, [0, 0, 0, 1, 1, 1, 1])
+    assert np.isfinite(rgb).all()
+    depth = -float(relief().height.min())
+    for sharp in (1 / depth, 1e6, 1e30):
+        fresh = random_sbtf(relief().height)
+        with pytest.warns(UserWarning, match="bends heights to their axis; .* is answered there"):
+            held = fresh.evaluate([0.3, 0.2], one, one, 0.5, sharp)
+        wanted = fresh.evaluate([0.3, 0.2], one, one, 0.5, 0.9 / depth)
+        # The curvature is held in float32.
+        np.testing.assert_allclose(held.reflectance, wanted.reflectance, rtol=1e-3, atol=1e-5)
+        assert held.opacity == wanted.opacity
+
+
+def test_group_4_straight_down_nothing_depends_on_the_direction_of_curvature() -> None:
+    material = random_sbtf(relief().height)
+    rng = np.random.default_rng(7)
+    uv, light = rng.random((200, 2)), [0.3, 0.1, 0.9]
+    plane = material.evaluate(uv, light, [0, 0, 1])
+    for bend in (1.0, -1.0, 5.0):
+        for tilt in ([0, 0, 1], [1e-7, 0, 1], [0, -1e-7, 1]):
+            rgb, opacity = material.evaluate(uv, light, tilt, 0.5, bend)
+            assert opacity.all()
+            # The place is the same to 1e-7 of a tile; light and view are those of the plane.
+            np.testing.assert_allclose(rgb, plane.reflectance, rtol=1e-3, atol=1e-4)
+
+
+def test_a_relief_of_no_depth_stops_every_ray() -> None:
+    material, query = random_sbtf(np.zeros((6, 9), np.float32)), on_cylinders(500)
+    assert material.sharpest == (-np.inf, np.inf)
+    rgb, opacity = material.evaluate(*query._replace(curvature=1e3 * query.curvature))
+    assert opacity.all()
+    plane = material.evaluate(*query._replace(curvature=np.zeros(1)))
+    np.testing.assert_allclose(rgb, plane.reflectance, rtol=1e-3, atol=1e-5)
+
+
+def test_an_sbtf_of_flat_rays_is_refused() -> None:
+    material = random_sbtf(relief().height)
+    flat = replace(material.spec, curved=False)
+    with pytest.raises(ValueError, match="an sbtf has curved heights"):
+        SBTF(flat, material.weights, material.header)
+
+
+@pytest.mark.parametrize("shape", ["cylinder", "torus"])
+def test_its_outline_on_a_shape_is_the_traced_one(shape) -> None:
+    light = np.array([[0.0, 0.6, 0.8]])
+    view = np.array([0.6, 0.0, 0.8])
+    covers = [
+        render(Scene(m, shape_of(shape), light), view=view, size=(64, 64)).cover > 0.5
+        for m in (random_sbtf(relief().height), TracedRelief(relief()))
+    ]
+    solid = render(
+        Scene(random_sbtf(np.zeros((4, 4), np.float32)), shape_of(shape), light),
+        view=view, size=(64, 64),
+    ).cover > 0.5  # fmt: skip
+    assert metrics.iou(*covers) > 0.99
+    assert metrics.iou(solid, covers[1]) < metrics.iou(*covers)
+    assert not (covers[0] & ~solid).any()
+
+
+def test_light_passes_where_rays_pass() -> None:
+    torus, view = shape_of("torus"), np.array([0.0, 0.0, 1.0])
+    light = np.array([[0.95, 0.0, 0.3122]])
+    shadows = []
+    for height in (relief().height, np.zeros((4, 4), np.float32)):
+        material = random_sbtf(height)
+        shadows.append(render(Scene(material, torus, light), view=view, size=(48, 48)))
+    deep, solid = shadows
+    # Rays that pass the outline of the near side reach the far side's inner wall.
+    assert (deep.radiance.sum(axis=2) > 0).sum() > 0
+    assert deep.cover.sum() < solid.cover.sum()
