@@ -37,7 +37,7 @@ import importlib, pkgutil, sys
 import btfkit
 count = 0
 for found in pkgutil.walk_packages(btfkit.__path__, "btfkit."):
-    if ".triton" not in found.name:
+    if not any(part in found.name for part in (".triton", ".mitsuba")):
         importlib.import_module(found.name)
         count += 1
 print(count, *{"devices", "calibration", "fitting"} & set(sys.modules))
