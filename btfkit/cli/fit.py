@@ -141,5 +141,5 @@ def _next(report: FitReport) -> str:
     out = shlex.quote(report.out or "")
     if report.material.model == "neubtf" and not report.untrained:
         return f"btfkit propagate guidance.png --model {out}"
-    drawn = report.material.model in PROGRAMS
+    drawn = report.material.model in PROGRAMS and not report.material.has_curvature
     return f"btfkit view {out}" if drawn else f"btfkit render {out} --shape sphere"
