@@ -69,7 +69,7 @@ def test_a_captured_btf_matches_the_tracer_at_its_stated_footprint_to_forty_deci
     assert found.psnr() >= 40, figures
     assert min(figures.values()) > 39, figures
     assert found.view.max() < 0.02
-    # Highlights to 0.01 or 0.02 px are 0.03 to 0.06 degrees each; axes and lamp share sixty.
+    # Highlights to 0.01 or 0.02 px are 0.03 to 0.06 degrees each; thirty share axes and lamp.
     assert found.light.max() < 0.06
 
 
