@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import ClassVar, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from btfkit.btf import BTF
 from btfkit.errors import FitError
@@ -101,7 +100,7 @@ class SBTF(Marching[Settings]):
         _, texels = self.engine.parameters()
         surface = self.layout.surface(texels)
         found = Heights(surface, self.layout.depth_scale, curved=True)
-        passes: NDArray[np.bool_] = np.isnan(batch.target[rows]).all(axis=1)
+        passes = np.asarray(np.isnan(batch.target[rows]).all(axis=1))
         surface += moved(
             found, batch.uv[rows], batch.view[rows], batch.curvature[rows], passes,
             aspect=self.layout.aspect, wrap=self.layout.wrap,
