@@ -6,9 +6,10 @@ Each material is traced from its relief, `--texels` deep and moved under the sur
 three times in `--steps` steps: `neumip` and `sbtf` to plane queries, whose heights are
 found from parallax alone, and `sbtf` to the relief itself (queries on the plane, convex and
 concave; heights given). The band holds the rays whose chord stays above the relief's bottom: all
-others are stopped for certain, and would only flatter. Truth on cylinders is the tracer; that of
-the torus is the relief on the torus itself, looked at every quarter of a texel along each ray.
-Everything is synthetic.
+others are stopped for certain, and would only flatter. With `--outlines` instead: heights found
+from curved queries, with and without what their opacity says. Truth on cylinders is the tracer;
+that of the torus is the relief on the torus itself, looked at every quarter of a texel along each
+ray. Everything is synthetic.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 
 from btfkit import metrics
 from btfkit.fitting.fit import fit
+from btfkit.fitting.sbtf.tracing import queries_of
 from btfkit.materials.base import Material
 from btfkit.materials.neumip.material import NeuMIPMaterial
 from btfkit.native.neural import bent
@@ -64,23 +66,19 @@ class Asked:
     texels: float
     steps: int
     pictures: Path | None
+    outlines: bool
 
 
 def measured(name: str, asked: Asked) -> dict[str, Any]:
     """All figures of one material."""
     relief = procedural.make(name, asked.size, relief_texels=asked.texels).under_surface()[0]
-    plane = random_queries(relief, A_TEXEL * asked.size**2, seed=1, samples=4)
-    models: dict[str, Material] = {
-        "neumip": fitted(plane, "neumip", asked, levels=1),
-        "sbtf, heights found": fitted(plane, "sbtf", asked, levels=1),
-        "sbtf, relief known": fitted(relief, "sbtf", asked, levels=1),
-    }
+    models = (on_outlines if asked.outlines else on_sources)(relief, asked)
     band = on_cylinders(relief)
     outline = torus_outline(relief)
     found: dict[str, Any] = {"material": name, "depth_tiles": depth_of(relief)}
-    found["error of heights, texels"] = height_error(models["sbtf, heights found"], relief)
     found["models"] = {
         model: {
+            "heights_rms_texels": height_error(material, relief),
             **errors(material, band),
             "plane_psnr": plane_psnr(material, relief),
             "torus_iou": metrics.iou(torus(material).cover > 0.5, outline),
@@ -91,6 +89,27 @@ def measured(name: str, asked: Asked) -> dict[str, Any]:
     if asked.pictures:
         draw(asked.pictures / f"{name}.png", [TracedRelief(relief), *models.values()])
     return found
+
+
+def on_sources(relief: Relief, asked: Asked) -> dict[str, Material]:
+    """Models of plane queries, and of the relief itself."""
+    plane = random_queries(relief, A_TEXEL * asked.size**2, seed=1, samples=4)
+    return {
+        "neumip": fitted(plane, "neumip", asked, levels=1),
+        "sbtf, heights found": fitted(plane, "sbtf", asked, levels=1),
+        "sbtf, relief known": fitted(relief, "sbtf", asked, levels=1),
+    }
+
+
+def on_outlines(relief: Relief, asked: Asked) -> dict[str, Material]:
+    """Models whose heights are found from queries on the plane and on curved surfaces."""
+    curved = queries_of(relief, seed=1).subset(slice(A_TEXEL * asked.size**2))
+    return {
+        f"sbtf, outlines {'heeded' if heeded else 'unheeded'}": fitted(
+            curved, "sbtf", asked, levels=1, outlines=heeded
+        )
+        for heeded in (False, True)
+    }
 
 
 def fitted(source: Any, model: str, asked: Asked, **settings: Any) -> Material:
@@ -223,8 +242,9 @@ def main() -> None:
     parser.add_argument("--texels", type=float, default=6.0)
     parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--outlines", action="store_true", help="what outlines add to heights")
     given = parser.parse_args()
-    asked = Asked(given.size, given.texels, given.steps, given.pictures)
+    asked = Asked(given.size, given.texels, given.steps, given.pictures, given.outlines)
     for name in given.materials:
         print(json.dumps(measured(name, asked)), flush=True)
 

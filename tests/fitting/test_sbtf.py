@@ -12,12 +12,15 @@ import btfkit
 from btfkit import metrics
 from btfkit.errors import FitError
 from btfkit.fitting.fit import fit
+from btfkit.fitting.sbtf.outlines import moved
 from btfkit.fitting.sbtf.tracing import queries_of
 from btfkit.materials.base import Header, Material
 from btfkit.materials.neumip.arrays import aligned, name_arrays
 from btfkit.materials.neumip.material import NeuMIP
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.materials.sbtf.material import SBTF
+from btfkit.native.neural import bent
+from btfkit.program import Heights
 from btfkit.queries import Query
 from btfkit.relief import procedural
 from btfkit.relief.material import TracedRelief
@@ -142,6 +145,56 @@ def test_heights_that_are_said_to_be_given_need_a_relief() -> None:
     assert not np.allclose(
         found.material.layout.surface(found.material.texels) * 0.05, relief().height, atol=1e-3
     )
+
+
+@pytest.mark.parametrize("wrap", [True, False])
+def test_outlines_alone_carve_heights_that_pass_what_passes(wrap) -> None:
+    query = on_cylinders(6000)
+    truth = Heights(relief().height / np.float32(0.05), 0.05, curved=True)
+    opacity = bent.meet(
+        truth, query.uv, query.view, query.curvature, aspect=1.0, wrap=wrap
+    ).opacity  # fmt: skip
+    # The bottom is known, so that the band is: all others are stopped for certain.
+    heights = np.zeros_like(truth.heights)
+    heights[0, 0] = truth.heights.min()
+    band = ~bent.rays_of(truth, query.view, query.curvature, 1.0).reaches
+
+    def iou(of: np.ndarray) -> float:
+        found = bent.meet(Heights(of, 0.05, curved=True), query.uv, query.view, query.curvature,
+                          aspect=1.0, wrap=wrap)  # fmt: skip
+        return metrics.iou(found.opacity[band], opacity[band])
+
+    before = iou(heights)
+    for _ in range(100):
+        heights = heights + moved(
+            Heights(heights, 0.05, curved=True), query.uv, query.view, query.curvature,
+            opacity == 0, aspect=1.0, wrap=wrap,
+        )  # fmt: skip
+    assert before < 0.6
+    assert iou(heights) > 0.9
+
+
+def test_without_opacity_no_outline_is_known() -> None:
+    queries = replace(queries_of(relief(), seed=5).subset(slice(3000)), opacity=None)
+    heights = []
+    for outlines in (True, False):
+        settings = {"batch": 512, "outlines": outlines}
+        model = fit(queries, model="sbtf", steps=8, settings=settings).material
+        heights.append(model.layout.surface(model.texels))
+    np.testing.assert_array_equal(*heights)
+
+
+@pytest.mark.slow
+def test_outlines_make_found_heights_better() -> None:
+    queries, query = queries_of(relief(), seed=6).subset(slice(60000)), on_cylinders()
+    truth = trace(relief(), query._replace(footprint=0 * query.footprint), samples=1).opacity
+    found = []
+    for outlines in (False, True):
+        settings = {"batch": 2048, "outlines": outlines}
+        model = fit(queries, model="sbtf", steps=600, settings=settings).material
+        found.append(metrics.iou(model.evaluate(*query).opacity, truth))
+    assert found[1] > found[0] + 0.05
+    assert found[1] > 0.8
 
 
 def test_given_heights_fit_textures_of_another_size() -> None:

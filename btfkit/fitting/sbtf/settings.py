@@ -16,10 +16,12 @@ class Settings(Stepped):
     Attributes:
         heights: "found" from what the views show, "given" by the relief that is the source;
             "auto" takes those of a relief and finds all others.
+        outlines: whether the opacity of curved rows bounds heights that are found.
         curvature: whether layers are told the curvature where the data have some.
     """
 
     heights: str = "auto"
+    outlines: bool = True
     curvature: bool = True
 
     def __post_init__(self) -> None:

@@ -14,13 +14,18 @@ from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.neumip.settings import INPUTS
 from btfkit.fitting.neumip.trainable import Marching
+from btfkit.fitting.sbtf.outlines import moved
 from btfkit.fitting.sbtf.settings import Settings
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.materials.sbtf import material as sbtf
 from btfkit.native.neural.layout import Array
 from btfkit.native.neural.lookup import bilinear
+from btfkit.program import Heights
 from btfkit.relief.relief import Relief
+
+# Steps between looks at outlines, and rows of a look.
+_OUTLINE_STEPS, _OUTLINE_ROWS = 4, 2048
 
 
 @final
@@ -75,7 +80,31 @@ class SBTF(Marching[Settings]):
             )
         loss = super().step(progress)
         self._keep_given()
+        if self._outlined and self._given is None and self._steps % _OUTLINE_STEPS == 0:
+            self._heed_outlines(progress)
         return loss
+
+    @property
+    def _outlined(self) -> bool:
+        """Whether the data say which rays pass."""
+        source = self._data
+        known = not isinstance(source, BTF) and source.opacity is not None
+        return known and self.settings.outlines
+
+    def _heed_outlines(self, progress: float) -> None:
+        """Move heights towards the opacity of some rows of the last batch."""
+        batch = self._source.batch(self._steps - 1, self._batch_size(progress))
+        if batch.curvature is None:
+            return
+        rows = np.flatnonzero(batch.curvature > 0)[:_OUTLINE_ROWS]
+        _, texels = self.engine.parameters()
+        surface = self.layout.surface(texels)
+        found = Heights(surface, self.layout.depth_scale, curved=True)
+        passes = np.asarray(np.isnan(batch.target[rows]).all(axis=1))
+        surface += moved(
+            found, batch.uv[rows], batch.view[rows], batch.curvature[rows], passes,
+            aspect=self.layout.aspect, wrap=self.layout.wrap,
+        )  # fmt: skip
 
     def _keep_given(self) -> None:
         if self._given is not None:
