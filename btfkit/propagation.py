@@ -28,7 +28,8 @@ from btfkit.fitting.neubtf.guides import encode
 from btfkit.fitting.neubtf.unet import Encoder
 from btfkit.io import images
 from btfkit.materials import file
-from btfkit.materials.neubtf import NeuBTF
+from btfkit.materials.neubtf.material import NeuBTF
+from btfkit.materials.neubtf.paper import NeuBTFPaper
 
 Array = NDArray[np.float32]
 # A guidance of more texels needs more memory for its encoder than most machines have.

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from btfkit import directions, metrics
 from btfkit.btf import BTF
 from btfkit.materials.evaluation import texel_centres
-from btfkit.materials.neubtf import NeuBTF
+from btfkit.materials.neubtf.material import NeuBTF
+from btfkit.materials.neubtf.paper import NeuBTFPaper
 from btfkit.nearfield import directions_at, texel_places
 from btfkit.synthesis.drift import Drift
 from btfkit.synthesis.indexmap import IndexMap

@@ -1,0 +1,19 @@
+"""NeuBTF with heights: textures that an encoder gave, answered as NeuMIP answers.
+
+Sources: Rodriguez-Pardo et al., "NeuBTF: Neural fields for BTF encoding and transfer", Computers &
+Graphics 114, 2023, whose future work names a parallax module; Kuznetsov et al., "NeuMIP:
+Multi-Resolution Neural Materials", ACM TOG 40(4), 2021.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+from btfkit.materials.neumip.material import NeuMIPMaterial
+
+
+@final
+class NeuBTF(NeuMIPMaterial):
+    """Heights and features of one guidance, and the decoder that they were fitted with."""
+
+    model: ClassVar[str] = "neubtf"
