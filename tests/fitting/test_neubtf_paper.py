@@ -1,4 +1,4 @@
-"""NeuBTF: its size, its twins, its fit, and guidance images of every kind."""
+"""NeuBTF as published: its size, its twins, its fit, and guidance images of every kind."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from btfkit.errors import FitError, FormatError
 from btfkit.fitting import fit, loop, losses
 from btfkit.fitting.neubtf import augment, guides, siren
 from btfkit.fitting.neubtf import data as neubtf_data
-from btfkit.fitting.neubtf import trainable as neubtf
+from btfkit.fitting.neubtf import paper as neubtf
 from btfkit.fitting.neubtf.siren import Renderer
 from btfkit.fitting.neubtf.unet import STRIDE, Encoder
 from btfkit.io import images
-from btfkit.materials.neubtf import NeuBTFSpec, renderer_shapes
+from btfkit.materials.neubtf.paper import NeuBTFSpec, renderer_shapes
 from btfkit.native.neural.plain import on_disc
 from btfkit.relief.synth import synth_btf
 
@@ -44,11 +44,11 @@ def tiny() -> BTF:
 
 @pytest.fixture(scope="module")
 def fitted(tiny: BTF, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("model") / "tiny.neubtf.safetensors"
+    out = tmp_path_factory.mktemp("model") / "tiny.neubtf-paper.safetensors"
     with pytest.MonkeyPatch.context() as patch:
         # Too few steps to carry well, and enough for the laws below.
         patch.setattr(neubtf, "_LEAST_TAUGHT", 1)
-        fit.fit(tiny, model="neubtf", steps=60, out=out, settings=TINY)
+        fit.fit(tiny, model="neubtf-paper", steps=60, out=out, settings=TINY)
     return out
 
 
@@ -65,7 +65,7 @@ def test_the_renderer_has_3011_weights() -> None:
 def test_numpy_answers_as_torch_does(parallax: str, wrap: Any) -> None:
     btf = replace(synth_btf("woven", size=16, lights="5", views="4", samples=1), wrap=wrap)
     settings = TINY | {"parallax": parallax, "encoder": "false", "precision": "float32"}
-    trainable = neubtf.NeuBTF(
+    trainable = neubtf.NeuBTFPaper(
         btf, np.arange(18), np.arange(18, 20), settings=settings, generators=loop.Generators(1)
     )
     for index in range(5):
@@ -199,7 +199,7 @@ def test_data_of_any_number_of_channels_guide_and_are_fitted(channels: int) -> N
         rng.random((8, 16, 16, channels), np.float32), light, np.tile([0, 0, 1.0], (8, 1)),
         channels=tuple(str(400 + 30 * i) for i in range(channels)),
     )  # fmt: skip
-    report = fit.fit(btf, model="neubtf", steps=6, settings=TINY)
+    report = fit.fit(btf, model="neubtf-paper", steps=6, settings=TINY)
     assert report.material.evaluate([0.5, 0.5], [0, 0, 1], [0, 0, 1]).reflectance.shape == (
         channels,
     )
@@ -209,7 +209,7 @@ def test_data_of_any_number_of_channels_guide_and_are_fitted(channels: int) -> N
 def test_a_fit_beats_lambert_on_a_tiny_btf() -> None:
     tiny = synth_btf("scratched", size=32, lights="25", views="9", samples=2, relief_texels=0.1)
     settings = {"encoder": "false", "texels": "256"}
-    report = fit.fit(tiny, model="neubtf", steps=600, settings=settings)
+    report = fit.fit(tiny, model="neubtf-paper", steps=600, settings=settings)
     lambert = fit.fit(tiny, model="lambert")
     # gloss that lambert cannot hold: a tenth of its error in 600 steps
     assert report.errors["mse"] < 0.3 * lambert.errors["mse"]
@@ -242,7 +242,7 @@ def test_equal_seed_and_steps_give_equal_bytes(tiny: BTF, tmp_path: Path) -> Non
     for name in ("a", "b"):
         fit.fit(
             tiny,
-            model="neubtf",
+            model="neubtf-paper",
             steps=20,
             out=tmp_path / f"{name}.safetensors",
             settings=TINY,
@@ -256,15 +256,15 @@ def test_a_resumed_fit_takes_the_same_trajectory(
     tiny: BTF, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, part = tmp_path / "whole.safetensors", tmp_path / "part.safetensors"
-    fit.fit(tiny, model="neubtf", steps=30, out=whole, settings=TINY)
-    original = neubtf.NeuBTF.step
-    monkeypatch.setattr(neubtf.NeuBTF, "step", _interrupted_after(original, 17))
-    report = fit.fit(tiny, model="neubtf", steps=30, out=part, settings=TINY)
+    fit.fit(tiny, model="neubtf-paper", steps=30, out=whole, settings=TINY)
+    original = neubtf.NeuBTFPaper.step
+    monkeypatch.setattr(neubtf.NeuBTFPaper, "step", _interrupted_after(original, 17))
+    report = fit.fit(tiny, model="neubtf-paper", steps=30, out=part, settings=TINY)
     assert report.interrupted
     assert part.is_file()
     assert report.steps == 17
-    monkeypatch.setattr(neubtf.NeuBTF, "step", original)
-    report = fit.fit(tiny, model="neubtf", steps=30, out=part, settings=TINY, resume=True)
+    monkeypatch.setattr(neubtf.NeuBTFPaper, "step", original)
+    report = fit.fit(tiny, model="neubtf-paper", steps=30, out=part, settings=TINY, resume=True)
     assert (report.steps, report.interrupted) == (30, False)
     for name, array in btfkit.load(whole).weights.items():
         np.testing.assert_array_equal(array, btfkit.load(part).weights[name])
@@ -286,28 +286,28 @@ def _interrupted_after(step: Any, count: int) -> Any:
 def test_group_24_a_diverging_loss_is_rolled_back_and_then_an_error(
     tiny: BTF, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = neubtf.NeuBTF.step
+    original = neubtf.NeuBTFPaper.step
     calls = []
 
     def once(self: Any, progress: float) -> float:
         calls.append(progress)
         return math.nan if len(calls) == 10 else original(self, progress)
 
-    monkeypatch.setattr(neubtf.NeuBTF, "step", once)
-    report = fit.fit(tiny, model="neubtf", steps=20, settings=TINY)
+    monkeypatch.setattr(neubtf.NeuBTFPaper, "step", once)
+    report = fit.fit(tiny, model="neubtf-paper", steps=20, settings=TINY)
     assert np.isfinite(report.errors["mse"])
-    monkeypatch.setattr(neubtf.NeuBTF, "step", lambda self, progress: math.inf)
-    with pytest.raises(FitError, match="neubtf diverges: loss inf at step 4"):
-        fit.fit(tiny, model="neubtf", steps=20, settings=TINY)
+    monkeypatch.setattr(neubtf.NeuBTFPaper, "step", lambda self, progress: math.inf)
+    with pytest.raises(FitError, match="neubtf-paper diverges: loss inf at step 4"):
+        fit.fit(tiny, model="neubtf-paper", steps=20, settings=TINY)
 
 
 def test_group_24_no_steps_one_pair_and_one_texel_still_end_in_a_model(tiny: BTF) -> None:
-    assert fit.fit(tiny, model="neubtf", steps=0).steps == 0
+    assert fit.fit(tiny, model="neubtf-paper", steps=0).steps == 0
     one = tiny.subset([4])
-    report = fit.fit(one, model="neubtf", steps=3, settings=TINY)
+    report = fit.fit(one, model="neubtf-paper", steps=3, settings=TINY)
     assert report.errors == {}
     texel = tiny.crop(slice(3, 4), slice(5, 6))
-    report = fit.fit(texel, model="neubtf", steps=3, settings=TINY)
+    report = fit.fit(texel, model="neubtf-paper", steps=3, settings=TINY)
     assert np.isfinite(report.errors["mse"])
 
 
@@ -315,16 +315,20 @@ def test_texels_that_are_not_measured_are_masked_and_counted(tiny: BTF) -> None:
     textures = np.stack([tiny.texture(i) for i in range(len(tiny))])
     textures[:, 3:9, 4:8] = np.nan
     textures[5, 20, 20] = np.inf
-    report = fit.fit(replace(tiny, textures=textures), model="neubtf", steps=12, settings=TINY)
+    report = fit.fit(
+        replace(tiny, textures=textures), model="neubtf-paper", steps=12, settings=TINY
+    )
     assert report.masked_texels >= 6 * 4 * (len(tiny) - 2)
     assert np.isfinite(report.errors["mse"])
     with pytest.raises(FitError, match="no texel of any texture is measured"):
-        fit.fit(replace(tiny, textures=np.full_like(textures, np.nan)), model="neubtf", steps=2)
+        fit.fit(
+            replace(tiny, textures=np.full_like(textures, np.nan)), model="neubtf-paper", steps=2
+        )
 
 
 def test_values_past_half_range_are_fitted_in_float32(tiny: BTF) -> None:
     textures = np.stack([tiny.texture(i) for i in range(len(tiny))]) * 1e5
-    report = fit.fit(replace(tiny, textures=textures), model="neubtf", steps=5, settings=TINY)
+    report = fit.fit(replace(tiny, textures=textures), model="neubtf-paper", steps=5, settings=TINY)
     assert np.isfinite(report.errors["mse"])
 
 
@@ -333,7 +337,7 @@ def test_values_past_half_range_are_fitted_in_float32(tiny: BTF) -> None:
     [
         (
             {"omegas": "3"},
-            r"no setting omegas \(did you mean omega\?\); it has omega, latents, encoder, parallax",
+            r"no setting omegas \(did you mean omega\?\); it has scales, frontal, crop, pool_mb, omega",
         ),
         ({"precision": "int8"}, "precision = 'int8'; expected float16 or float32"),
         ({"first": "0.9", "second": "0.2"}, "they must leave a rest"),
@@ -345,13 +349,13 @@ def test_settings_that_make_no_sense_are_refused(
     tiny: BTF, given: dict[str, str], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        fit.fit(tiny, model="neubtf", steps=1, settings=given)
+        fit.fit(tiny, model="neubtf-paper", steps=1, settings=given)
 
 
 @pytest.mark.parametrize("holdout", [-0.1, 1.0])
 def test_a_holdout_that_leaves_nothing_is_refused(tiny: BTF, holdout: float) -> None:
     with pytest.raises(ValueError, match="expected 0 up to, but not, 1"):
-        fit.fit(tiny, model="neubtf", steps=1, holdout=holdout)
+        fit.fit(tiny, model="neubtf-paper", steps=1, holdout=holdout)
 
 
 @given(st.integers(2, 500), st.floats(0.01, 0.4), st.integers(0, 9))
@@ -366,7 +370,7 @@ def test_training_and_test_pairs_are_disjoint_complete_and_repeatable(
 
 
 def test_the_report_stands_beside_the_model(fitted: Path) -> None:
-    report = json.loads(fitted.with_name("tiny.neubtf.report.json").read_text())
+    report = json.loads(fitted.with_name("tiny.neubtf-paper.report.json").read_text())
     for key in ("mse", "psnr", "mse_log1p", "psnr_log1p", "mae", "psnr_srgb", "ssim_srgb", "flip"):
         assert math.isfinite(report[key])
     assert (report["steps"], report["parameters"]) == (60, 3011)
@@ -377,10 +381,10 @@ def test_the_report_stands_beside_the_model(fitted: Path) -> None:
 
 def test_resuming_without_a_state_is_refused(tiny: BTF, tmp_path: Path) -> None:
     with pytest.raises(FitError, match="nothing to resume"):
-        fit.fit(tiny, model="neubtf", steps=1, out=tmp_path / "m.safetensors", resume=True)
+        fit.fit(tiny, model="neubtf-paper", steps=1, out=tmp_path / "m.safetensors", resume=True)
     (tmp_path / "m.safetensors.state").write_bytes(b"nonsense")
     with pytest.raises(FormatError, match="not a readable state"):
-        fit.fit(tiny, model="neubtf", steps=1, out=tmp_path / "m.safetensors", resume=True)
+        fit.fit(tiny, model="neubtf-paper", steps=1, out=tmp_path / "m.safetensors", resume=True)
 
 
 # --- propagation ---------------------------------------------------------------------------------
@@ -514,7 +518,7 @@ def test_real_lights_of_one_view_are_fitted(real_data: Path, tmp_path: Path) -> 
     btf = btfkit.open(real_data / "ubo2003_wallpaper").crop(slice(0, 64), slice(0, 64))
     report = fit.fit(
         btf,
-        model="neubtf",
+        model="neubtf-paper",
         steps=150,
         settings=TINY | {"encoder": "false"},
         out=tmp_path / "w.safetensors",

@@ -11,11 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from btfkit.fitting.neubtf import augment
-from btfkit.fitting.neubtf.encoder import Encoder
-from btfkit.fitting.neubtf.guides import encode
-from btfkit.materials.base import Array, Header
+from btfkit import metrics
+from btfkit.btf import BTF
+from btfkit.fitting.neubtf import augment, unet
+from btfkit.fitting.neubtf.encoder import STRIDE, Encoder, encode_in_tiles
+from btfkit.fitting.neubtf.guides import Window, encode, multiple
+from btfkit.materials.base import Array, Header, Material
+from btfkit.materials.evaluation import answer_pair
 from btfkit.materials.neubtf.material import NeuBTF
+from btfkit.materials.neubtf.paper import NeuBTFPaper
 
 # Deviation of the features that the guidance itself gives.
 _TIED = 0.3
@@ -46,14 +50,7 @@ class Carrier:
             torch.from_numpy(np.array(arrays[name])) for name in ("mean", "deviation", "axes")
         )
         encoder = Encoder(INPUTS, len(mean), torch.Generator())
-        prefix = "encoder."
-        encoder.load_state_dict(
-            {
-                name.removeprefix(prefix): torch.from_numpy(np.array(value))
-                for name, value in arrays.items()
-                if name.startswith(prefix)
-            }
-        )
+        encoder.load_state_dict(_encoder_of(arrays))
         return Carrier(encoder.eval(), mean, deviation, axes)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -62,21 +59,31 @@ class Carrier:
         named |= {"mean": self.mean, "deviation": self.deviation, "axes": self.axes}
         return {name: value.detach().numpy().copy() for name, value in named.items()}
 
-    def textures(self, guidance: Tensor, *, wrap: bool, averaged: bool = True) -> tuple[Array, Array]:
+    def textures(
+        self, guidance: Tensor, *, wrap: bool, averaged: bool = True
+    ) -> tuple[Array, Array]:
         """Heights (h, w) in texels, and features (h, w, free + tied), of a guidance.
 
         Args:
             guidance: (1, 3, h, w) sRGB encoded, 0..1.
             wrap: whether it is periodic. averaged: whether it is a mean over many lights.
         """
+        h, w = guidance.shape[-2:]
+        # A periodic guidance that the stride does not divide is resampled, and its textures back.
+        even = wrap and (h % STRIDE or w % STRIDE)
+        size = (multiple(h), multiple(w)) if even else (h, w)
         with torch.no_grad():
-            answer = encode(lambda image: self.encoder(of_kind(image, averaged)), guidance, wrap=wrap)
+            seen = augment.standardised(augment.resized(guidance, size, wrap=wrap))
+            answer = encode_in_tiles(self.encoder, of_kind(seen, averaged), wrap=wrap)
+            answer = augment.resized(answer, (h, w), wrap=wrap)
             found = answer[0].permute(1, 2, 0) * self.deviation + self.mean
             tied = tied_features(guidance, self.axes)
             features = torch.cat([found[..., 1:], tied], dim=-1)
         return found[..., 0].numpy(), features.numpy()
 
-    def carried(self, material: NeuBTF, guidance: Tensor, header: Header, *, averaged: bool = True) -> NeuBTF:
+    def carried(
+        self, material: NeuBTF, guidance: Tensor, header: Header, *, averaged: bool = True
+    ) -> NeuBTF:
         """A material on another guidance.
 
         Args:
@@ -85,13 +92,48 @@ class Carrier:
         """
         heights, features = self.textures(guidance, wrap=header.wrap == "wrap", averaged=averaged)
         size: tuple[int, int] = (heights.shape[0], heights.shape[1])
-        spec = replace(material.spec, size=size, precision=_stored(material.spec.precision))
+        spec = replace(material.spec, size=size)
         weights = {n: a for n, a in material.weights.items() if not n.startswith("texture.")}
         kind = np.dtype(spec.precision)
         scaled = heights / (spec.depth_scale * size[1])
         weights["texture.heights"] = scaled[..., None].astype(kind)
         weights["texture.0.0"] = features.astype(kind)
         return NeuBTF(spec, weights, header)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class PaperCarrier:
+    """The published encoder, and mean and deviation (latents,) of what it gives."""
+
+    encoder: unet.Encoder
+    mean: Tensor
+    deviation: Tensor
+
+    @staticmethod
+    def of(arrays: Mapping[str, NDArray[Any]]) -> PaperCarrier:
+        """From what a file holds; KeyError or RuntimeError where it is not of one."""
+        mean, deviation = (torch.from_numpy(np.array(arrays[n])) for n in ("mean", "deviation"))
+        encoder = unet.Encoder(len(mean), torch.Generator())
+        encoder.load_state_dict(_encoder_of(arrays))
+        return PaperCarrier(encoder.eval(), mean, deviation)
+
+    def carried(self, material: NeuBTFPaper, guidance: Tensor, header: Header) -> NeuBTFPaper:
+        """As `Carrier.carried`."""
+        with torch.no_grad():
+            encoded = encode(self.encoder, guidance, wrap=header.wrap == "wrap")
+            texture = encoded[0].permute(1, 2, 0) * self.deviation + self.mean
+        kind = material.weights["texture"].dtype
+        weights = {**material.weights, "texture": texture.numpy().astype(kind)}
+        size = (int(texture.shape[0]), int(texture.shape[1]))
+        return NeuBTFPaper(replace(material.spec, size=size), weights, header)
+
+
+# What carries a model, by its name.
+CARRIERS: dict[str, type[Carrier] | type[PaperCarrier]] = {
+    "neubtf": Carrier,
+    "neubtf-paper": PaperCarrier,
+}
 
 
 def of_kind(image: Tensor, averaged: bool) -> Tensor:
@@ -118,6 +160,30 @@ def tied_features(guidance: Tensor, axes: Tensor) -> Tensor:
     return _TIED * colours @ axes.T
 
 
-def _stored(precision: str) -> Any:
-    """Textures of a carried material are floats: int8 has the fitted one's range."""
-    return "float16" if precision == "int8" else precision
+# Of what is carried: PSNR, linear and of log(1 + rgb).
+ERRORS = ("psnr_carried", "psnr_log1p_carried")
+
+
+def errors_in(
+    material: Material, btf: BTF, pairs: NDArray[np.intp], window: Window
+) -> dict[str, float]:
+    """Errors by the keys of `ERRORS` over a window of some pairs; empty where none is measured."""
+    pooled = metrics.Pooled()
+    rows = slice(window.top, window.top + window.height)
+    cols = slice(window.left, window.left + window.width)
+    for pair in pairs:
+        answer = answer_pair(material, btf, int(pair))
+        pooled.add(answer[rows, cols], btf.texture(int(pair))[rows, cols])
+    if not pooled.values:
+        return {}
+    errors = pooled.errors()
+    return dict(zip(ERRORS, (errors["psnr"], errors["psnr_log1p"]), strict=True))
+
+
+def _encoder_of(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Tensor]:
+    prefix = "encoder."
+    return {
+        name.removeprefix(prefix): torch.from_numpy(np.array(value))
+        for name, value in arrays.items()
+        if name.startswith(prefix)
+    }

@@ -17,6 +17,10 @@ from torch import Tensor, nn
 WIDTHS = (24, 48, 96)
 # The coarsest level has texels of this many of the guidance's.
 STRIDE = 2 ** len(WIDTHS)
+# No texel further away than this has a say in what a texel becomes: 42, and up to a whole stride.
+REACH = 48
+# Larger guidance is encoded in parts of this many texels a side.
+_PART = 1024
 
 
 @final
@@ -76,6 +80,37 @@ class Encoder(nn.Module):
             finer = F.interpolate(x, scale_factor=2.0, mode="nearest")
             x = _through(block, torch.cat([passed.pop(), finer], dim=1))
         return F.pixel_shuffle(self.out(torch.cat([x, first], dim=1)), 2)
+
+
+def encode_in_tiles(encoder: Encoder, guidance: Tensor, *, wrap: bool) -> Tensor:
+    """(1, outputs, h, w) of a guidance (1, inputs, h, w) of any size, in bounded memory.
+
+    Beyond the border a periodic guidance goes on from its other side, and needs sides that the
+    stride divides; any other one is mirrored.
+    """
+    h, w = guidance.shape[-2:]
+    if wrap and max(h, w) <= _PART:
+        return encoder(guidance)
+    bands = []
+    for top in range(0, h, _PART):
+        parts = []
+        for left in range(0, w, _PART):
+            high, wide = min(_PART, h - top), min(_PART, w - left)
+            rows, cols = _around(top, high, h, wrap=wrap), _around(left, wide, w, wrap=wrap)
+            answer = encoder(guidance[:, :, rows][:, :, :, cols])
+            parts.append(answer[:, :, REACH : REACH + high, REACH : REACH + wide])
+        bands.append(torch.cat(parts, dim=3))
+    return torch.cat(bands, dim=2)
+
+
+def _around(start: int, count: int, side: int, *, wrap: bool) -> Tensor:
+    """Indices of `count` texels and of REACH and more on both sides of them."""
+    length = -(-count // STRIDE) * STRIDE
+    at = torch.arange(start - REACH, start + length + REACH)
+    if wrap:
+        return at % side
+    at = at % (2 * side)
+    return torch.where(at < side, at, 2 * side - 1 - at)
 
 
 def _through(block: nn.Module, x: Tensor) -> Tensor:

@@ -33,8 +33,8 @@ from btfkit.fitting.neubtf.siren import ParallaxHead, Renderer, on_disc
 from btfkit.fitting.neubtf.unet import Encoder
 from btfkit.fitting.pool import Pool
 from btfkit.fitting.schedule import pace
-from btfkit.materials.neubtf import paper as evaluated
 from btfkit.materials.base import Header
+from btfkit.materials.neubtf import paper as evaluated
 from btfkit.materials.neubtf.paper import NeuBTFSpec
 from btfkit.settings import parsed
 

@@ -1,4 +1,4 @@
-"""NeuBTF with heights while it is fitted: free textures first, then an encoder that gives them back.
+"""NeuBTF with heights while it is fitted: free textures, then an encoder that gives them back.
 
 1. NeuMIP's heights, features and decoder, by its own engine; some features are held equal to the
    guidance's main colours, so that the decoder learns to read these from any guidance.
@@ -20,12 +20,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from btfkit import metrics
 from btfkit.btf import BTF
 from btfkit.fitting.interpolation import images_of
 from btfkit.fitting.loop import Generators, Trainable, restore_tensors, tensors_of
 from btfkit.fitting.neubtf import augment
-from btfkit.fitting.neubtf.carrier import INPUTS, Carrier, colour_axes, of_kind, tied_features
+from btfkit.fitting.neubtf.carrier import (
+    ERRORS,
+    INPUTS,
+    Carrier,
+    colour_axes,
+    errors_in,
+    of_kind,
+    tied_features,
+)
 from btfkit.fitting.neubtf.data import frontal_slice
 from btfkit.fitting.neubtf.encoder import Encoder
 from btfkit.fitting.neubtf.guides import Guide, Guides, Window
@@ -34,7 +41,6 @@ from btfkit.fitting.neubtf.settings import Settings
 from btfkit.fitting.neumip.data import TexelSource
 from btfkit.fitting.neumip.trainable import NeuMIP
 from btfkit.fitting.schedule import pace
-from btfkit.materials.evaluation import answer_pair
 from btfkit.materials.neubtf.material import NeuBTF as Evaluated
 from btfkit.settings import parsed
 
@@ -101,6 +107,7 @@ class NeuBTF(Trainable):
         self._weight = torch.ones(1 + free) / (1 + free)
         self._carried: dict[str, float] = {}
         self._taught, self._level = 0, 0.0
+        self._wanted: Tensor | None = None
         self.encoder = Encoder(INPUTS, 1 + free, self._generators.torch)
         self._optimisers: dict[str, torch.optim.Optimizer] = {
             "muon": Muon(self.encoder.matrices()),
@@ -181,8 +188,9 @@ class NeuBTF(Trainable):
         (self._taught,) = self._count_from(state["numbers"])
         self._mean, self._deviation = state["mean"].clone(), state["deviation"].clone()
         self._weight = state["weight"].clone()
+        self._wanted = None
         self._level, *carried = state["carried"].tolist()
-        self._carried = dict(zip(_CARRIED, carried, strict=False))
+        self._carried = dict(zip(ERRORS, carried, strict=False))
 
     # --- the two parts ---------------------------------------------------------------------
 
@@ -237,17 +245,7 @@ class NeuBTF(Trainable):
 
     def _teach(self, done: float) -> float:
         guide = self._guides.draw()
-        wanted = (self._free_channels() - self._mean[:, None, None]) / self._deviation[:, None, None]
-        counts = torch.ones(1, 1, *wanted.shape[1:])
-        if self._kept and not self._carried:
-            top, left, height, width = self._kept
-            counts[..., top : top + height, left : left + width] = 0
-        wanted, counts = (self._seen(part, guide) for part in (wanted[None], counts))
-        if guide.scaled:
-            # A texel of a smaller guidance is a larger one of the data.
-            scale = guide.size[1] / guide.window.width
-            wanted[:, :1] = wanted[:, :1] * scale + self._mean[0] * (scale - 1) / self._deviation[0]
-        self._trim(counts, guide)
+        wanted, counts = self._lesson(guide)
         answer = self.encoder(of_kind(guide.image, guide.averaged))
         square = (self._weight[:, None, None] * (answer - wanted).square()).sum(1, keepdim=True)
         loss = (square * counts).sum() / counts.sum().clamp_min(1)
@@ -256,14 +254,31 @@ class NeuBTF(Trainable):
         # In the measure of the first part, so that the loop does not take the step for a leap.
         return float(loss.detach()) * max(self._level, 1e-6)
 
+    def _lesson(self, guide: Guide) -> tuple[Tensor, Tensor]:
+        """What the encoder has to give for a guide, standardised, and 1 where it counts, else 0."""
+        if self._wanted is None:
+            mean, deviation = (part[:, None, None] for part in (self._mean, self._deviation))
+            self._wanted = ((self._free_channels() - mean) / deviation)[None]
+        everywhere = torch.ones(1, 1, *self._wanted.shape[2:])
+        if self._kept and not self._carried:
+            top, left, height, width = self._kept
+            everywhere[..., top : top + height, left : left + width] = 0
+        wanted, counts = self._seen(self._wanted, guide), self._seen(everywhere, guide)
+        if guide.scaled:
+            # A texel of a smaller guidance is a larger one of the data.
+            scale = guide.size[1] / guide.window.width
+            wanted[:, :1] = wanted[:, :1] * scale + self._mean[0] * (scale - 1) / self._deviation[0]
+        self._trim(counts, guide)
+        return wanted, counts
+
     def _seen(self, part: Tensor, guide: Guide) -> Tensor:
         seen = self._guides.windowed(part, guide.window)
         return augment.resized(seen, guide.size, wrap=False).clone()
 
     def _trim(self, counts: Tensor, guide: Guide) -> None:
         """Leave out where a crop's encoder sees around a border that is none."""
-        whole = self._btf.shape[1:3]
-        for dim, side, crop in ((2, whole[0], guide.window.height), (3, whole[1], guide.window.width)):
+        crops = (guide.window.height, guide.window.width)
+        for dim, side, crop in zip((2, 3), self._btf.shape[1:3], crops, strict=True):
             length = counts.shape[dim]
             if (self._wrap and crop == side) or length <= 4 * _MARGIN:
                 continue
@@ -295,22 +310,3 @@ class NeuBTF(Trainable):
         carried = self.carrier().carried(material, self._guidance, material.header)
         order = np.random.default_rng([self._generators.seed, 0xCA2]).permutation(self._test)
         return errors_in(carried, self._btf, order[:_CARRIED_PAIRS], window)
-
-
-_CARRIED = ("psnr_carried", "psnr_log1p_carried")
-
-
-def errors_in(
-    material: Evaluated, btf: BTF, pairs: NDArray[np.intp], window: Window
-) -> dict[str, float]:
-    """PSNR, linear and of log(1 + rgb), over a window of some pairs; empty where none is measured."""
-    pooled = metrics.Pooled()
-    rows = slice(window.top, window.top + window.height)
-    cols = slice(window.left, window.left + window.width)
-    for pair in pairs:
-        answer = answer_pair(material, btf, int(pair))
-        pooled.add(answer[rows, cols], btf.texture(int(pair))[rows, cols])
-    if not pooled.values:
-        return {}
-    errors = pooled.errors()
-    return dict(zip(_CARRIED, (errors["psnr"], errors["psnr_log1p"]), strict=True))

@@ -9,11 +9,15 @@ from __future__ import annotations
 
 from typing import ClassVar, final
 
-from btfkit.materials.neumip.material import NeuMIPMaterial
+from btfkit.materials.neubtf.paper import NeuBTFPaper
+from btfkit.materials.neumip.material import AnyNeuMIP
 
 
 @final
-class NeuBTF(NeuMIPMaterial):
+class NeuBTF(AnyNeuMIP):
     """Heights and features of one guidance, and the decoder that they were fitted with."""
 
     model: ClassVar[str] = "neubtf"
+
+
+AnyNeuBTF = NeuBTF | NeuBTFPaper
