@@ -1,0 +1,360 @@
+"""NeuBTF with heights: what is taught, what is kept from it, and what a guidance becomes."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import btfkit
+from btfkit import propagation
+from btfkit.btf import BTF
+from btfkit.errors import FitError, FormatError
+from btfkit.fitting import fit, loop
+from btfkit.fitting.neubtf import augment, carrier, muon
+from btfkit.fitting.neubtf import encoder as encoders
+from btfkit.fitting.neubtf import paper as published
+from btfkit.fitting.neubtf import trainable as neubtf
+from btfkit.fitting.neubtf.data import frontal_slice
+from btfkit.fitting.neubtf.encoder import STRIDE, Encoder
+from btfkit.materials import file
+from btfkit.materials.neubtf.paper import NeuBTFPaper
+from btfkit.relief.synth import synth_btf
+from btfkit.synthesis import tile_neubtf
+
+TINY: dict[str, str] = {"batch": "1024"}
+STEPS = 160
+# Nothing but the encoder says what is carried.
+UNTIED = TINY | {"tied": "0", "free": "0.6"}
+UNTIED_STEPS = 260
+
+
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture(scope="module")
+def tiny() -> BTF:
+    lazy = synth_btf("woven", size=32, lights="9", views="9", samples=2)
+    return replace(lazy, textures=lazy.textures.batch(range(len(lazy))))
+
+
+@pytest.fixture(scope="module")
+def fitted(tiny: BTF, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("model") / "tiny.neubtf.safetensors"
+    fit.fit(tiny, model="neubtf", steps=STEPS, out=out, settings=TINY)
+    return out
+
+
+@pytest.fixture(scope="module")
+def untied(tiny: BTF, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("model") / "untied.neubtf.safetensors"
+    fit.fit(tiny, model="neubtf", steps=UNTIED_STEPS, out=out, settings=UNTIED)
+    return out
+
+
+def begun(btf: BTF, **settings: str) -> neubtf.NeuBTF:
+    n = len(btf)
+    return neubtf.NeuBTF(
+        btf, np.arange(n - 4), np.arange(n - 4, n), settings=TINY | settings,
+        generators=loop.Generators(0),
+    )  # fmt: skip
+
+
+def guidance_of(btf: BTF) -> torch.Tensor:
+    return augment.encoded(frontal_slice(btf, np.arange(len(btf))))[None]
+
+
+# --- the encoder and what moves it ---------------------------------------------------------------
+
+
+def test_the_encoder_moves_with_the_image_by_multiples_of_its_stride() -> None:
+    encoder = Encoder(4, 7, generator()).eval()
+    guide = torch.rand(1, 4, 32, 48, generator=generator())
+    with torch.no_grad():
+        shifted = encoder(guide.roll((STRIDE, 3 * STRIDE), (2, 3)))
+        ours = encoder(guide).roll((STRIDE, 3 * STRIDE), (2, 3))
+    # float32 sums in another order
+    torch.testing.assert_close(shifted, ours, atol=1e-5, rtol=1e-4)
+    with pytest.raises(ValueError, match=r"guidance of 12 x 16; expected multiples of 8"):
+        encoder(torch.zeros(1, 4, 12, 16))
+
+
+@pytest.mark.parametrize("wrap", [True, False])
+def test_guidance_encoded_in_parts_is_guidance_encoded_whole(
+    wrap: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encoder = Encoder(4, 7, generator()).eval()
+    guide = torch.rand(1, 4, 96, 144, generator=generator())
+    with torch.no_grad():
+        whole = encoders.encode_in_tiles(encoder, guide, wrap=wrap)
+        monkeypatch.setattr(encoders, "_PART", 64)
+        parts = encoders.encode_in_tiles(encoder, guide, wrap=wrap)
+    # float32 sums in another order; a reach too short would show at parts' edges
+    torch.testing.assert_close(parts, whole, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(24, 144), (96, 72), (7, 7)])
+def test_muon_moves_along_matrices_whose_singular_values_lie_near_one(
+    shape: tuple[int, int],
+) -> None:
+    matrix = torch.randn(shape, generator=generator(), dtype=torch.float64)
+    found = muon.orthogonalised(matrix)
+    values = torch.linalg.svdvals(found)
+    # the quintic of the source ends between 0.68 and 1.13 for all but the least values
+    assert values.max() < 1.3
+    assert values.median() > 0.6
+    left, _, right = torch.linalg.svd(matrix, full_matrices=False)
+    # same singular vectors: what is left beside the diagonal is rounding
+    inner = left.T @ found @ right.T
+    assert (inner - torch.diag(inner.diag())).abs().max() < 1e-6
+    assert (muon.orthogonalised(torch.zeros(3, 4)) == 0).all()
+
+
+# --- the two parts -------------------------------------------------------------------------------
+
+
+def test_tied_features_are_the_colours_of_the_guidance_itself(tiny: BTF, fitted: Path) -> None:
+    arrays = file.training_arrays(fitted)
+    train, _ = btfkit.split(len(tiny))
+    guidance = augment.encoded(frontal_slice(tiny, train))[None]
+    wanted = carrier.tied_features(guidance, torch.from_numpy(arrays["axes"])).numpy()
+    features = btfkit.load(fitted).weights["texture.0.0"]
+    # float16 textures
+    np.testing.assert_allclose(features[..., 6:].astype(np.float32), wanted, atol=2e-3)
+    # the first of the axes sees most of what varies
+    assert wanted[..., 0].std() >= wanted[..., 1].std()
+
+
+def test_a_quarter_is_kept_from_the_encoder_until_it_has_been_measured(tiny: BTF) -> None:
+    model = begun(tiny)
+    model.step(0.0)
+    model.step(0.3)
+    assert model._kept == (8, 8, 16, 16)
+    model._guides = replace_draw(model._guides)
+    guide = model._guides.draw()
+    _, counts = model._lesson(guide)
+    assert counts.sum() == 32 * 32 - 16 * 16
+    assert model.stated() == {}
+    model.step(0.95)
+    assert model.stated()["carried_window"] == [8, 8, 16, 16]
+    _, counts = model._lesson(guide)
+    assert counts.sum() == 32 * 32
+    small = tiny.crop(slice(0, 24), slice(0, 24))
+    assert begun(small)._kept is None
+
+
+def replace_draw(guides: Any) -> Any:
+    """The same guides, unmoved."""
+    guides._window = lambda: neubtf.Window(0, 0, 32, 32)
+    return guides
+
+
+def test_what_counts_for_the_answer_counts_in_the_teaching(tiny: BTF) -> None:
+    model = begun(tiny)
+    for index in range(30):
+        model.step(0.2 * index / 30)
+    layout = model.free.layout
+    weights, _ = model.free.engine.parameters()
+    _, decoder = layout.split(weights)
+    # A decoder that does not read a feature: neither itself nor through a frame.
+    layout.decoder.layers(decoder)[0][0][:, 1] = 0
+    layout.decoder.layers(decoder)[0][0][:, 8:10] = 0
+    model._aim()
+    assert model._weight[2] < 1e-6
+    assert (model._weight[[0, 4, 5, 6]] > 1e-5).all()
+    torch.testing.assert_close(model._weight.sum(), torch.tensor(1.0))
+
+
+def test_an_encoder_that_learns_nothing_shows_in_what_is_carried_and_not_in_its_own(
+    tiny: BTF, untied: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = json.loads(untied.with_name("untied.neubtf.report.json").read_text())
+    monkeypatch.setattr(neubtf.NeuBTF, "_optimise", lambda *_: None)
+    failed = fit.fit(tiny, model="neubtf", steps=UNTIED_STEPS, settings=UNTIED).errors
+    assert failed["psnr_own"] == good["psnr_own"] == good["psnr"]
+    # an encoder that gives the mean texture everywhere has lost all structure
+    assert good["psnr_carried"] > failed["psnr_carried"] + 1
+
+
+def test_a_corrupted_encoder_shows_in_an_evaluation(
+    tiny: BTF, untied: Path, tmp_path: Path
+) -> None:
+    arrays = file.training_arrays(untied)
+    name = "encoder.out.weight"
+    arrays[name] = np.random.default_rng(0).permuted(arrays[name], axis=1)
+    file.save(btfkit.load(untied), tmp_path / "bad.safetensors", training=arrays)
+    test = btfkit.split(len(tiny))[1]
+    good, bad = (
+        propagation.errors_carried(path, tiny, pairs=test)
+        for path in (untied, tmp_path / "bad.safetensors")
+    )
+    assert good["psnr_carried"] > bad["psnr_carried"] + 1
+    assert set(good) == {"psnr_carried", "psnr_log1p_carried"}
+
+
+def test_eval_states_own_and_carried(
+    tiny: BTF, fitted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from btfkit.cli import btfkit as group
+    from btfkit.cli.outcome import run
+    from btfkit.io.store import writer
+
+    store = writer.write(tiny, tmp_path / "a.btf.zarr", dtype="float32")
+    assert run(group, ["eval", str(fitted), str(store), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["psnr_own"] == found["psnr"]
+    assert found["carried_window"] == [8, 8, 16, 16]
+    assert 10 < found["psnr_carried"] < 60
+
+
+def test_equal_seed_and_steps_give_equal_bytes_and_resume_goes_the_same_way(
+    tiny: BTF, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, again, part = (tmp_path / f"{name}.safetensors" for name in ("a", "b", "c"))
+    for out in (whole, again):
+        fit.fit(tiny, model="neubtf", steps=40, out=out, settings=TINY, seed=3)
+    assert whole.read_bytes() == again.read_bytes()
+    original, taken = neubtf.NeuBTF.step, [0]
+
+    def stopping(self: Any, progress: float) -> float:
+        taken[0] += 1
+        if taken[0] == 25:
+            raise KeyboardInterrupt
+        return original(self, progress)
+
+    monkeypatch.setattr(neubtf.NeuBTF, "step", stopping)
+    report = fit.fit(tiny, model="neubtf", steps=40, out=part, settings=TINY, seed=3)
+    assert report.interrupted
+    monkeypatch.setattr(neubtf.NeuBTF, "step", original)
+    fit.fit(tiny, model="neubtf", steps=40, out=part, settings=TINY, seed=3, resume=True)
+    ours, theirs = file.training_arrays(whole), file.training_arrays(part)
+    for name, array in (btfkit.load(whole).weights | ours).items():
+        np.testing.assert_array_equal(array, (btfkit.load(part).weights | theirs)[name])
+
+
+def test_group_24_no_steps_one_pair_one_texel_and_no_test_still_end_in_a_model(tiny: BTF) -> None:
+    assert fit.fit(tiny, model="neubtf", steps=0).untrained
+    assert fit.fit(tiny.subset([4]), model="neubtf", steps=6, settings=TINY).errors == {}
+    texel = tiny.crop(slice(3, 4), slice(5, 6))
+    for btf, options in ((texel, {}), (tiny, {"holdout": 0.0})):
+        report = fit.fit(btf, model="neubtf", steps=6, settings=TINY, **options)
+        uv = np.random.default_rng(0).random((9, 2))
+        answer = report.material.evaluate(uv, [0.5, 0, 0.8], [0, 0.6, 0.8]).reflectance
+        assert np.isfinite(answer).all()
+        assert "psnr_carried" not in report.errors
+
+
+def test_texels_that_are_not_measured_are_masked_and_counted(tiny: BTF) -> None:
+    values = np.array(tiny.textures, np.float32)
+    values[:, 3:9, 4:8] = np.nan
+    report = fit.fit(replace(tiny, textures=values), model="neubtf", steps=24, settings=TINY)
+    assert report.masked_texels >= 24 * (len(tiny) - 8)
+    assert math.isfinite(report.errors["psnr_carried"])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"frontals": "3"}, r"no setting frontals \(did you mean frontal\?\); it has scales"),
+        ({"precision": "int8"}, "precision = 'int8'; expected float16 or float32"),
+        ({"free": "1"}, "free = 1.0; expected more than 0 and less than 1"),
+        ({"tied": "3"}, "tied = 3; expected 0 to 2"),
+        ({"rate": "0"}, "rate = 0.0; expected more than 0, up to 1"),
+        ({"frontal": "2"}, "frontal = 2.0; expected 0 to 1"),
+        ({"crop": "0"}, "crop and pool_mb must be at least 1"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(
+    tiny: BTF, given: dict[str, str], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        fit.fit(tiny, model="neubtf", steps=1, settings=given)
+
+
+# --- other guidance ------------------------------------------------------------------------------
+
+
+def test_a_guidance_repeated_is_the_material_repeated_heights_and_all(
+    tiny: BTF, fitted: Path
+) -> None:
+    picture = guidance_of(tiny)[0].permute(1, 2, 0).numpy() ** 2.2
+    one = propagation.propagate(picture, fitted, wrap="wrap")
+    four = propagation.propagate(np.tile(picture, (2, 2, 1)), fitted, wrap="wrap")
+    heights = [m.weights["texture.heights"].astype(np.float32) for m in (one, four)]
+    assert np.ptp(heights[0]) > 0
+    # float16, in tile widths
+    np.testing.assert_allclose(heights[1][:32, :32], heights[0] / 2, atol=1e-3)
+    rng = np.random.default_rng(0)
+    uv, light, view = rng.random((200, 2)), [0.3, 0.2, 0.9], [-0.5, 0.3, 0.8]
+    answers = [m.evaluate(at, light, view).reflectance for m, at in ((one, uv), (four, uv / 2))]
+    # heights and features in float16, magnified where a ray grazes
+    assert np.abs(answers[0] - answers[1]).mean() < 2e-3
+
+
+def test_guidance_of_any_size_and_scale_is_carried(fitted: Path) -> None:
+    rng = np.random.default_rng(0)
+    for size in ((1, 1), (7, 40), (33, 17)):
+        for wrap in ("wrap", "clamp"):
+            picture = rng.random((*size, 3)).astype(np.float32)
+            carried = propagation.propagate(picture, fitted, wrap=wrap)  # type: ignore[arg-type]
+            assert carried.header.grid == size
+            answer = carried.evaluate(rng.random((20, 2)), [0, 0.3, 0.9], [0.2, 0, 0.9])
+            assert np.isfinite(answer.reflectance).all()
+    half = propagation.propagate(rng.random((40, 64, 3)).astype(np.float32), fitted, scale=0.5)
+    assert half.header.grid == (20, 32)
+
+
+def test_a_tile_keeps_its_heights_in_texels(fitted: Path) -> None:
+    rng = np.random.default_rng(0)
+    coarse = torch.from_numpy(rng.random((1, 3, 20, 26)).astype(np.float32))
+    picture = augment.resized(coarse, (60, 78), wrap=False)[0].permute(1, 2, 0).numpy()
+    carried = propagation.propagate(picture, fitted)
+    tile, tiling = tile_neubtf(carried)
+    assert tile.header.grid == tiling.index.size != carried.header.grid
+    texels = [
+        m.weights["texture.heights"].astype(np.float32) * m.header.grid[1] for m in (carried, tile)
+    ]
+    # float16
+    np.testing.assert_allclose(tiling.index.of(texels[0]), texels[1], rtol=2e-3, atol=1e-4)
+
+
+# --- files of before -----------------------------------------------------------------------------
+
+
+def test_a_file_of_the_published_model_under_its_old_name_is_read_as_what_it_is(
+    tiny: BTF, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "old.neubtf.safetensors"
+    with monkeypatch.context() as patch:
+        patch.setattr(NeuBTFPaper, "model", "neubtf")
+        patch.setattr(published, "_LEAST_TAUGHT", 1)
+        settings = {"texels": "64", "pairs": "4"}
+        fit.fit(tiny, model="neubtf-paper", steps=20, out=path, settings=settings)
+    assert b'"model":"neubtf"' in path.read_bytes()
+    assert btfkit.load(path).model == file.header_of(path)["model"] == "neubtf-paper"
+    assert propagation.has_encoder(path)
+    picture = np.random.default_rng(0).random((16, 24, 3)).astype(np.float32)
+    assert propagation.propagate(picture, path).model == "neubtf-paper"
+
+
+def test_a_propagated_model_cannot_be_propagated_and_a_foreign_encoder_is_refused(
+    fitted: Path, tmp_path: Path
+) -> None:
+    picture = np.random.default_rng(0).random((16, 24, 3)).astype(np.float32)
+    propagation.propagate(picture, fitted, out=tmp_path / "p.safetensors")
+    assert btfkit.load(tmp_path / "p.safetensors").model == "neubtf"
+    assert not propagation.has_encoder(tmp_path / "p.safetensors")
+    with pytest.raises(FitError, match="has no encoder"):
+        propagation.propagate(picture, tmp_path / "p.safetensors")
+    arrays = file.training_arrays(fitted)
+    del arrays["encoder.out.bias"]
+    file.save(btfkit.load(fitted), tmp_path / "bad.safetensors", training=arrays)
+    with pytest.raises(FormatError, match="the encoder does not fit this version"):
+        propagation.propagate(picture, tmp_path / "bad.safetensors")
