@@ -31,7 +31,7 @@ from btfkit.synthesis import tile_neubtf
 TINY: dict[str, str] = {"batch": "1024"}
 STEPS = 160
 # Nothing but the encoder says what is carried.
-UNTIED = TINY | {"tied": "0", "free": "0.6"}
+UNTIED = TINY | {"tied": "0", "free": "0.6", "own": "0"}
 UNTIED_STEPS = 260
 
 
@@ -120,37 +120,53 @@ def test_muon_moves_along_matrices_whose_singular_values_lie_near_one(
 # --- the two parts -------------------------------------------------------------------------------
 
 
-def test_tied_features_are_the_colours_of_the_guidance_itself(tiny: BTF, fitted: Path) -> None:
-    arrays = file.training_arrays(fitted)
-    train, _ = btfkit.split(len(tiny))
-    guidance = augment.encoded(frontal_slice(tiny, train))[None]
-    wanted = carrier.tied_features(guidance, torch.from_numpy(arrays["axes"])).numpy()
-    features = btfkit.load(fitted).weights["texture.0.0"]
-    # float16 textures
-    np.testing.assert_allclose(features[..., 6:].astype(np.float32), wanted, atol=2e-3)
+def test_features_are_tied_to_the_colours_of_the_guidance_until_the_encoder_has_its_aim(
+    tiny: BTF,
+) -> None:
+    model = begun(tiny)
+    wanted = carrier.tied_features(model._guidance, model._axes).numpy()
     # the first of the axes sees most of what varies
-    assert wanted[..., 0].std() >= wanted[..., 1].std()
+    assert wanted[..., 0].std() >= wanted[..., 1].std() > 0
+
+    def features() -> np.ndarray:
+        _, texels = model.free.engine.parameters()
+        return model.free.layout.textures(texels)[0][0].copy()
+
+    for index in range(4):
+        model.step(0.2 * index / 4)
+        np.testing.assert_array_equal(features()[..., 6:], wanted)
+    decoder = model.free.engine.parameters()[0].copy()
+    model.step(0.26)
+    assert (features()[..., 6:] != wanted).any()
+    # what the encoder is to give was fixed before, and the decoder that reads it stays
+    np.testing.assert_array_equal(model.free.engine.parameters()[0], decoder)
+    aim, free = model._wanted, features()
+    assert aim is not None
+    model.step(0.28)
+    assert (features()[..., :6] != free[..., :6]).any()
+    assert model._wanted is aim
 
 
 def test_a_quarter_is_kept_from_the_encoder_until_it_has_been_measured(tiny: BTF) -> None:
     model = begun(tiny)
     model.step(0.0)
-    model.step(0.3)
+    model.step(0.27)
     assert model._kept == (8, 8, 16, 16)
-    model._guides = replace_draw(model._guides)
-    guide = model._guides.draw()
-    _, counts = model._lesson(guide)
+    aim = model._wanted
+    assert aim is not None
+    guide = whole(model._guides).draw()
+    _, counts = model._lesson(guide, aim)
     assert counts.sum() == 32 * 32 - 16 * 16
     assert model.stated() == {}
     model.step(0.95)
     assert model.stated()["carried_window"] == [8, 8, 16, 16]
-    _, counts = model._lesson(guide)
+    _, counts = model._lesson(guide, aim)
     assert counts.sum() == 32 * 32
     small = tiny.crop(slice(0, 24), slice(0, 24))
     assert begun(small)._kept is None
 
 
-def replace_draw(guides: Any) -> Any:
+def whole(guides: Any) -> Any:
     """The same guides, unmoved."""
     guides._window = lambda: neubtf.Window(0, 0, 32, 32)
     return guides
@@ -264,7 +280,7 @@ def test_texels_that_are_not_measured_are_masked_and_counted(tiny: BTF) -> None:
     [
         ({"frontals": "3"}, r"no setting frontals \(did you mean frontal\?\); it has scales"),
         ({"precision": "int8"}, "precision = 'int8'; expected float16 or float32"),
-        ({"free": "1"}, "free = 1.0; expected more than 0 and less than 1"),
+        ({"free": "0.9", "own": "0.1"}, "free = 0.9 and own = 0.1; they must leave a rest"),
         ({"tied": "3"}, "tied = 3; expected 0 to 2"),
         ({"rate": "0"}, "rate = 0.0; expected more than 0, up to 1"),
         ({"frontal": "2"}, "frontal = 2.0; expected 0 to 1"),

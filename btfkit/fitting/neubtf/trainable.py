@@ -2,12 +2,13 @@
 
 1. NeuMIP's heights, features and decoder, by its own engine; some features are held equal to the
    guidance's main colours, so that the decoder learns to read these from any guidance.
-2. The encoder, taught to give heights and free features for varied guidance, each weighted by how
-   much the answer depends on it. A quarter of the area is kept from it, tells how well it carries,
-   and is then given back.
+2. These textures alone, no longer held, until they answer for their own sample best.
+3. The encoder, taught to give the heights and features of the first part for varied guidance, each
+   weighted by how much the answer depends on it. A quarter of the area is kept from it, tells how
+   well it carries, and is then given back.
 
-The material keeps the free textures: for its own guidance they are the encoder's answer and what
-that lacks. docs/neubtf.md says what was tried.
+The material keeps the textures of the second part: for its own guidance they are the encoder's
+answer and what that lacks. docs/neubtf.md says what was tried.
 """
 
 from __future__ import annotations
@@ -118,19 +119,22 @@ class NeuBTF(Trainable):
 
     def step(self, progress: float) -> float:
         self._steps += 1
-        share = self.settings.free
-        if progress < share:
-            loss = self.free.step(progress / share)
+        first, both = self.settings.free, self.settings.free + self.settings.own
+        if progress < first:
+            self._level = self.free.step(progress / first)
             self._hold()
             self.queries = self.free.queries
-            self._level = loss
+            return self._level
+        if self._wanted is None:
+            self._wanted = self._aim()
+        if progress < both:
+            loss = self.free.refine((progress - first) / self.settings.own)
+            self.queries = self.free.queries
             return loss
-        if not self._taught:
-            self._aim()
-        done = (progress - share) / (1 - share)
+        done = (progress - both) / (1 - both)
         if self._kept and done >= _GIVEN_BACK and not self._carried:
             self._carried = self._measured(self._kept)
-        return self._teach(done)
+        return self._teach(done, self._wanted)
 
     def settled(self, progress: float) -> bool:
         # The own error does not tell how well the encoder carries: the last state is the best.
@@ -174,6 +178,8 @@ class NeuBTF(Trainable):
         found["numbers"] = self._counters(self._taught)
         found |= {"mean": self._mean.clone(), "deviation": self._deviation.clone()}
         carried = [self._level, *self._carried.values()]
+        if self._wanted is not None:
+            found["wanted"] = self._wanted.clone()
         return found | {
             "weight": self._weight.clone(),
             "carried": torch.tensor(carried, dtype=torch.float64),
@@ -188,7 +194,7 @@ class NeuBTF(Trainable):
         (self._taught,) = self._count_from(state["numbers"])
         self._mean, self._deviation = state["mean"].clone(), state["deviation"].clone()
         self._weight = state["weight"].clone()
-        self._wanted = None
+        self._wanted = state["wanted"].clone() if "wanted" in state else None
         self._level, *carried = state["carried"].tolist()
         self._carried = dict(zip(ERRORS, carried, strict=False))
 
@@ -202,23 +208,23 @@ class NeuBTF(Trainable):
             channels = self.free.layout.banks[0].channels
             finest[..., channels - self._tied.shape[-1] : channels] = self._tied
 
-    def _free_channels(self) -> Tensor:
-        """(1 + free, h, w) heights in texels and free features, as they stand."""
+    def _aim(self) -> Tensor:
+        """What the encoder is taught, (1, 1 + free, h, w) standardised: heights, free features.
+
+        Fixes how much each of them counts, too.
+        """
         layout = self.free.layout
         _, texels = self.free.engine.parameters()
         free = len(self._mean) - 1
         heights = layout.surface(texels) * (layout.depth_scale * self._btf.shape[2])
         features = layout.textures(texels)[0][0][..., :free]
         together = np.concatenate([heights[..., None], features], axis=-1)
-        return torch.from_numpy(together).permute(2, 0, 1).contiguous()
-
-    def _aim(self) -> None:
-        """Fix what the encoder is taught, and how much each channel of it counts."""
-        channels = self._free_channels().flatten(1)
-        self._mean = channels.mean(dim=1)
-        self._deviation = channels.std(dim=1, correction=0).clamp_min(1e-4)
+        channels = torch.from_numpy(together).permute(2, 0, 1)[None]
+        self._mean = channels.mean(dim=(0, 2, 3))
+        self._deviation = channels.std(dim=(0, 2, 3), correction=0).clamp_min(1e-4)
         felt = torch.tensor(self._felt()) * self._deviation**2
         self._weight = felt / felt.sum().clamp_min(1e-20)
+        return (channels - self._mean[:, None, None]) / self._deviation[:, None, None]
 
     def _felt(self) -> list[float]:
         """Mean squared change of log(1 + rgb) a unit (texel, or 1) of every channel's square."""
@@ -243,9 +249,9 @@ class NeuBTF(Trainable):
             for n, k, s, unit in steps
         ]
 
-    def _teach(self, done: float) -> float:
+    def _teach(self, done: float, aim: Tensor) -> float:
         guide = self._guides.draw()
-        wanted, counts = self._lesson(guide)
+        wanted, counts = self._lesson(guide, aim)
         answer = self.encoder(of_kind(guide.image, guide.averaged))
         square = (self._weight[:, None, None] * (answer - wanted).square()).sum(1, keepdim=True)
         loss = (square * counts).sum() / counts.sum().clamp_min(1)
@@ -254,16 +260,13 @@ class NeuBTF(Trainable):
         # In the measure of the first part, so that the loop does not take the step for a leap.
         return float(loss.detach()) * max(self._level, 1e-6)
 
-    def _lesson(self, guide: Guide) -> tuple[Tensor, Tensor]:
+    def _lesson(self, guide: Guide, aim: Tensor) -> tuple[Tensor, Tensor]:
         """What the encoder has to give for a guide, standardised, and 1 where it counts, else 0."""
-        if self._wanted is None:
-            mean, deviation = (part[:, None, None] for part in (self._mean, self._deviation))
-            self._wanted = ((self._free_channels() - mean) / deviation)[None]
-        everywhere = torch.ones(1, 1, *self._wanted.shape[2:])
+        everywhere = torch.ones(1, 1, *aim.shape[2:])
         if self._kept and not self._carried:
             top, left, height, width = self._kept
             everywhere[..., top : top + height, left : left + width] = 0
-        wanted, counts = self._seen(self._wanted, guide), self._seen(everywhere, guide)
+        wanted, counts = self._seen(aim, guide), self._seen(everywhere, guide)
         if guide.scaled:
             # A texel of a smaller guidance is a larger one of the data.
             scale = guide.size[1] / guide.window.width
