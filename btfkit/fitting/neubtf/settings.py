@@ -21,7 +21,7 @@ class Guidance:
     """
 
     scales: float = 1.0
-    frontal: float = 0.75
+    frontal: float = 0.9
     crop: int = 128
     pool_mb: int = DEFAULT_BYTES >> 20
 

@@ -18,6 +18,7 @@ class NeuBTF(AnyNeuMIP):
     """Heights and features of one guidance, and the decoder that they were fitted with."""
 
     model: ClassVar[str] = "neubtf"
+    has_levels: ClassVar[bool] = False
 
 
 AnyNeuBTF = NeuBTF | NeuBTFPaper
