@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from btfkit import directions, metrics
 from btfkit.btf import BTF
+from btfkit.materials.base import Header
 from btfkit.materials.evaluation import texel_centres
-from btfkit.materials.neubtf.material import AnyNeuBTF
+from btfkit.materials.neubtf.material import AnyNeuBTF, NeuBTF
+from btfkit.materials.neubtf.paper import NeuBTFPaper
 from btfkit.nearfield import directions_at, texel_places
 from btfkit.synthesis.drift import Drift
 from btfkit.synthesis.indexmap import IndexMap
@@ -167,16 +169,23 @@ def tile_neubtf(material: AnyNeuBTF) -> tuple[AnyNeuBTF, Tiling]:
         wrap="wrap",
         provenance={**material.header.provenance, "tiled": tiling.record()},
     )
-    weights = {
-        name: tiling.index.of(array) if name.startswith("texture") else array
-        for name, array in material.weights.items()
-    }
-    if "texture.heights" in weights:
-        # In tile widths, and the tile is another.
-        heights = weights["texture.heights"]
-        weights["texture.heights"] = (heights.astype(np.float32) * (w / q)).astype(heights.dtype)
-    tile = type(material)(replace(material.spec, size=(p, q)), weights, header)
+    tile = _moved(material, tiling.index, header)
     return tile, replace(tiling, seam_ratio=_seam_of_answers(tile))
+
+
+def _moved(material: AnyNeuBTF, index: IndexMap, header: Header) -> AnyNeuBTF:
+    """A material whose finest textures are taken by a map."""
+    weights = dict(material.weights)
+    spec: Any = replace(material.spec, size=index.size)
+    if isinstance(material, NeuBTFPaper):
+        weights["texture"] = index.of(weights["texture"])
+        return NeuBTFPaper(spec, weights, header)
+    weights["texture.0.0"] = index.of(weights["texture.0.0"])
+    heights = index.of(weights["texture.heights"])
+    # In tile widths, and the tile is another.
+    ratio = np.float32(material.spec.size[1] / index.size[1])
+    weights["texture.heights"] = (heights.astype(np.float32) * ratio).astype(heights.dtype)
+    return NeuBTF.of_finest(spec, weights, header)
 
 
 def _tiling(summary: Summary) -> Tiling:

@@ -23,7 +23,10 @@ from btfkit.fitting.neubtf import paper as published
 from btfkit.fitting.neubtf import trainable as neubtf
 from btfkit.fitting.neubtf.data import frontal_slice
 from btfkit.fitting.neubtf.encoder import STRIDE, Encoder
+from btfkit.footprint import gaussian
 from btfkit.materials import file
+from btfkit.materials.evaluation import texel_centres
+from btfkit.materials.neubtf.material import NeuBTF
 from btfkit.materials.neubtf.paper import NeuBTFPaper
 from btfkit.relief.synth import synth_btf
 from btfkit.synthesis import tile_neubtf
@@ -57,6 +60,15 @@ def untied(tiny: BTF, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("model") / "untied.neubtf.safetensors"
     fit.fit(tiny, model="neubtf", steps=UNTIED_STEPS, out=out, settings=UNTIED)
     return out
+
+
+@pytest.fixture(scope="module")
+def sharp(tiny: BTF) -> NeuBTF:
+    """A material of good textures, whatever its encoder."""
+    settings = TINY | {"free": "0.98", "own": "0", "kept": "false"}
+    material = fit.fit(tiny, model="neubtf", steps=600, settings=settings, holdout=0.0).material
+    assert isinstance(material, NeuBTF)
+    return material
 
 
 def begun(btf: BTF, **settings: str) -> neubtf.NeuBTF:
@@ -339,6 +351,37 @@ def test_a_tile_keeps_its_heights_in_texels(fitted: Path) -> None:
     ]
     # float16
     np.testing.assert_allclose(tiling.index.of(texels[0]), texels[1], rtol=2e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("size", [(32, 32), (31, 45), (1, 6)])
+def test_coarser_levels_are_means_of_the_finest_features(
+    size: tuple[int, int], fitted: Path
+) -> None:
+    picture = np.random.default_rng(0).random((*size, 3)).astype(np.float32)
+    weights = propagation.propagate(picture, fitted).weights
+    mean = weights["texture.0.0"].astype(np.float32).mean(axis=(0, 1))
+    last = max(size).bit_length() - 1
+    assert weights[f"texture.0.{last}"].shape == (1, 1, 8)
+    for level in range(1, last + 1):
+        # float16, of order one
+        found = weights[f"texture.0.{level}"].astype(np.float32).mean(axis=(0, 1))
+        np.testing.assert_allclose(found, mean, atol=3e-3)
+
+
+@pytest.mark.parametrize("level", [1, 2, 3])
+def test_a_blurred_query_is_answered_nearer_to_the_blurred_truth_than_a_sharp_one(
+    level: int, tiny: BTF, sharp: NeuBTF
+) -> None:
+    material, footprint = sharp, 0.5 * 2.0**level
+    blur = gaussian(32, footprint**2 - 0.25, wrap=True)
+    errors = np.zeros(2)
+    for pair in range(0, len(tiny), 8):
+        truth = np.einsum("ij,jkc,lk->ilc", blur, tiny.texture(pair), blur)
+        for k, asked in enumerate((footprint, 0.5)):
+            at = texel_centres(32, 32)
+            answer = material.evaluate(at, tiny.light[pair], tiny.view[pair], asked).reflectance
+            errors[k] += np.square(answer - truth).mean()
+    assert errors[0] < 0.7 * errors[1]
 
 
 # --- files of before -----------------------------------------------------------------------------

@@ -98,7 +98,7 @@ class Carrier:
         scaled = heights / (spec.depth_scale * size[1])
         weights["texture.heights"] = scaled[..., None].astype(kind)
         weights["texture.0.0"] = features.astype(kind)
-        return NeuBTF(spec, weights, header)
+        return NeuBTF.of_finest(spec, weights, header)
 
 
 @final

@@ -100,7 +100,11 @@ class NeuBTF(Trainable):
         layout = self.free.layout
         self._tied = tied_features(self._guidance, self._axes).numpy()
         free = layout.banks[0].channels - self._tied.shape[-1]
-        _, texels = self.free.engine.parameters()
+        weights, texels = self.free.engine.parameters()
+        # One level is trained: coarser ones are answered as if they were it.
+        network = layout.decoder
+        first, _ = network.layers(layout.split(weights)[1])[0]
+        first[:, network.directions.index("level") - len(network.directions)] = 0
         # What the guidance cannot say need not be there from the start.
         layout.textures(texels)[0][0][..., :free] *= 0.1
         self._hold()
@@ -158,7 +162,7 @@ class NeuBTF(Trainable):
 
     def material(self) -> Evaluated:
         found = self.free.material()
-        return Evaluated(found.spec, found.weights, found.header)
+        return Evaluated.of_finest(found.spec, found.weights, found.header)
 
     def training_arrays(self) -> dict[str, NDArray[Any]]:
         """What propagation needs beside the material: the encoder."""
