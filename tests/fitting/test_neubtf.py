@@ -34,7 +34,7 @@ from btfkit.synthesis import tile_neubtf
 TINY: dict[str, str] = {"batch": "1024"}
 STEPS = 160
 # Nothing but the encoder says what is carried.
-UNTIED = TINY | {"tied": "0", "free": "0.6", "own": "0"}
+UNTIED = TINY | {"tied": "0", "free": "0.6"}
 UNTIED_STEPS = 260
 
 
@@ -65,7 +65,7 @@ def untied(tiny: BTF, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def sharp(tiny: BTF) -> NeuBTF:
     """A material of good textures, whatever its encoder."""
-    settings = TINY | {"free": "0.98", "own": "0", "kept": "false"}
+    settings = TINY | {"free": "0.98", "kept": "false"}
     material = fit.fit(tiny, model="neubtf", steps=600, settings=settings, holdout=0.0).material
     assert isinstance(material, NeuBTF)
     return material
@@ -132,31 +132,16 @@ def test_muon_moves_along_matrices_whose_singular_values_lie_near_one(
 # --- the two parts -------------------------------------------------------------------------------
 
 
-def test_features_are_tied_to_the_colours_of_the_guidance_until_the_encoder_has_its_aim(
-    tiny: BTF,
-) -> None:
+def test_features_are_tied_to_the_colours_of_the_guidance(tiny: BTF) -> None:
     model = begun(tiny)
     wanted = carrier.tied_features(model._guidance, model._axes).numpy()
     # the first of the axes sees most of what varies
     assert wanted[..., 0].std() >= wanted[..., 1].std() > 0
-
-    def features() -> np.ndarray:
-        _, texels = model.free.engine.parameters()
-        return model.free.layout.textures(texels)[0][0].copy()
-
-    for index in range(4):
-        model.step(0.2 * index / 4)
-        np.testing.assert_array_equal(features()[..., 6:], wanted)
-    decoder = model.free.engine.parameters()[0].copy()
-    model.step(0.26)
-    assert (features()[..., 6:] != wanted).any()
-    # what the encoder is to give was fixed before, and the decoder that reads it stays
-    np.testing.assert_array_equal(model.free.engine.parameters()[0], decoder)
-    aim, free = model._wanted, features()
-    assert aim is not None
-    model.step(0.28)
-    assert (features()[..., :6] != free[..., :6]).any()
-    assert model._wanted is aim
+    for index in range(6):
+        model.step(0.3 * index / 5)
+        features = model.material().weights["texture.0.0"]
+        # float16
+        np.testing.assert_allclose(features[..., 6:], wanted, atol=2e-3)
 
 
 def test_a_quarter_is_kept_from_the_encoder_until_it_has_been_measured(tiny: BTF) -> None:
@@ -292,7 +277,7 @@ def test_texels_that_are_not_measured_are_masked_and_counted(tiny: BTF) -> None:
     [
         ({"frontals": "3"}, r"no setting frontals \(did you mean frontal\?\); it has scales"),
         ({"precision": "int8"}, "precision = 'int8'; expected float16 or float32"),
-        ({"free": "0.9", "own": "0.1"}, "free = 0.9 and own = 0.1; they must leave a rest"),
+        ({"free": "1"}, "free = 1.0; expected more than 0 and less than 1"),
         ({"tied": "3"}, "tied = 3; expected 0 to 2"),
         ({"rate": "0"}, "rate = 0.0; expected more than 0, up to 1"),
         ({"frontal": "2"}, "frontal = 2.0; expected 0 to 1"),

@@ -41,7 +41,6 @@ class Settings(Guidance):
 
     Attributes:
         free: share of the budget that the free textures and their decoder take.
-        own: share of it in which the textures, no longer tied, come to fit their own sample best.
         tied: features that are colour components of the guidance itself, 0 to 2.
         kept: whether a quarter of the area is kept from the encoder at first, for `psnr_carried`.
         rate: peak learning rate of the encoder.
@@ -50,7 +49,6 @@ class Settings(Guidance):
     """
 
     free: float = 0.25
-    own: float = 0.05
     tied: int = 2
     kept: bool = True
     rate: float = 4e-2
@@ -61,8 +59,8 @@ class Settings(Guidance):
         super().__post_init__()
         if self.precision not in ("float16", "float32"):
             raise ValueError(f"precision = {self.precision!r}; expected float16 or float32")
-        if not (self.free > 0 and self.own >= 0 and self.free + self.own < 1):
-            raise ValueError(f"free = {self.free} and own = {self.own}; they must leave a rest")
+        if not 0 < self.free < 1:
+            raise ValueError(f"free = {self.free}; expected more than 0 and less than 1")
         if not 0 <= self.tied <= 2:
             raise ValueError(f"tied = {self.tied}; expected 0 to 2")
         if not 0 < self.rate <= 1:

@@ -2,13 +2,12 @@
 
 1. NeuMIP's heights, features and decoder, by its own engine; some features are held equal to the
    guidance's main colours, so that the decoder learns to read these from any guidance.
-2. These textures alone, no longer held, until they answer for their own sample best.
-3. The encoder, taught to give the heights and features of the first part for varied guidance, each
-   weighted by how much the answer depends on it. A quarter of the area is kept from it, tells how
-   well it carries, and is then given back.
+2. The encoder, taught to give heights and free features for varied guidance, each weighted by how
+   much the answer depends on it. A quarter of the area is kept from it, tells how well it carries,
+   and is then given back.
 
-The material keeps the textures of the second part: for its own guidance they are the encoder's
-answer and what that lacks. docs/neubtf.md says what was tried.
+The material keeps the free textures: for its own guidance they are the encoder's answer and what
+that lacks. docs/neubtf.md says what was tried.
 """
 
 from __future__ import annotations
@@ -123,19 +122,15 @@ class NeuBTF(Trainable):
 
     def step(self, progress: float) -> float:
         self._steps += 1
-        first, both = self.settings.free, self.settings.free + self.settings.own
-        if progress < first:
-            self._level = self.free.step(progress / first)
+        share = self.settings.free
+        if progress < share:
+            self._level = self.free.step(progress / share)
             self._hold()
             self.queries = self.free.queries
             return self._level
         if self._wanted is None:
             self._wanted = self._aim()
-        if progress < both:
-            loss = self.free.refine((progress - first) / self.settings.own)
-            self.queries = self.free.queries
-            return loss
-        done = (progress - both) / (1 - both)
+        done = (progress - share) / (1 - share)
         if self._kept and done >= _GIVEN_BACK and not self._carried:
             self._carried = self._measured(self._kept)
         return self._teach(done, self._wanted)
