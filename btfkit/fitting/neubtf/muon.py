@@ -59,7 +59,13 @@ def orthogonalised(matrix: Tensor) -> Tensor:
     tall = matrix.shape[0] > matrix.shape[1]
     x = matrix.T if tall else matrix
     x = x / x.norm().clamp_min(1e-12)
+    # Every iteration multiplies by a polynomial of the Gram matrix; they are gathered, and the wide
+    # matrix is multiplied once.
+    gram, factor = x @ x.T, torch.eye(len(x), dtype=x.dtype)
     for _ in range(_ITERATIONS):
-        gram = x @ x.T
-        x = a * x + (b * gram + c * gram @ gram) @ x
-    return x.T if tall else x
+        step = b * gram + c * gram @ gram
+        step.diagonal().add_(a)
+        factor = step @ factor
+        gram = step @ step @ gram
+    found = factor @ x
+    return found.T if tall else found
