@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from btfkit.footprint import level_sizes, most_levels
 from btfkit.materials.base import Header
 from btfkit.materials.neubtf.paper import NeuBTFPaper
-from btfkit.materials.neumip.material import AnyNeuMIP
+from btfkit.materials.neumip.material import NeuMIPMaterial
 from btfkit.materials.neumip.spec import NeuMIPSpec
 
 
 @final
-class NeuBTF(AnyNeuMIP):
+class NeuBTF(NeuMIPMaterial):
     """Heights and features of one guidance, and the decoder that they were fitted with."""
 
     model: ClassVar[str] = "neubtf"
