@@ -1,17 +1,21 @@
-"""NeuBTF: error against time, beside the same renderer with free textures, interpolation and PCA.
+"""NeuBTF: its own error and what it carries; the published one beside free textures and PCA.
 
+    python benchmarks/neubtf.py -o FOLDER --only carried [--cpu 36]
     python benchmarks/neubtf.py -o FOLDER [--budget 600] [--free 300] [--only NAME ...] [--plot PNG]
 
-Everything is synthetic: traced on Bonn-81 directions at 128 x 128 from materials of known relief.
+Everything is synthetic: traced from materials of known relief, at 128 x 128 on Bonn-81 directions
+(`carried`: at 96 x 96 on 25 x 25 of them, one thread, carried onto a tile of another seed).
 Each cell is written to FOLDER when it is done; a second run goes on where the first one stopped.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import os
 import platform
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -32,7 +36,7 @@ from btfkit.relief.trace import traced_btf
 # Material -> height of its structure, texels of the 128 x 128 tile; None is its own.
 FLAT: dict[str, float | None] = {"brick": 1.5, "gravel": 1.5, "woven": 1.5, "print": None}
 STEEP: dict[str, float | None] = {"cobbles": None}
-SIZE, HOLDOUT, SEED = 128, 0.05, 0
+SIZE, SMALL, HOLDOUT, SEED = 128, 96, 0.05, 0
 
 
 class Cells:
@@ -79,8 +83,8 @@ def compare(cells: Cells, name: str, relief: float | None, budget: float, free: 
     """One material: encoder, free textures, interpolation, PCA at equal bytes."""
     btf = cells.store(name, relief)
     model = cells.folder / f"{name}.safetensors"
-    report = cells.get(f"{name}-neubtf", lambda: fitted(btf, "neubtf", budget, model))
-    cells.get(f"{name}-free", lambda: fitted(btf, "neubtf", free, None, encoder="false"))
+    report = cells.get(f"{name}-neubtf", lambda: fitted(btf, "neubtf-paper", budget, model))
+    cells.get(f"{name}-free", lambda: fitted(btf, "neubtf-paper", free, None, encoder="false"))
     size = str(int(report["bytes"]))
     cells.get(f"{name}-pca", lambda: fitted(btf, "pca", 1, None, bytes=size))
     cells.get(f"{name}-interpolation", lambda: fitted(btf, "interpolation", 1, None))
@@ -94,8 +98,76 @@ def parallax(cells: Cells, name: str, relief: float | None, budget: float) -> No
     for head in ("false", "true"):
         cells.get(
             f"{name}-free-parallax-{head}",
-            lambda head=head: fitted(btf, "neubtf", budget, None, encoder="false", parallax=head),
+            lambda head=head: fitted(
+                btf, "neubtf-paper", budget, None, encoder="false", parallax=head
+            ),
         )
+
+
+def carried(cells: Cells, name: str, model: str, cpu: float) -> None:
+    """A tile fitted for some CPU seconds, and carried onto a tile of another seed."""
+    tiles = []
+    for seed in (0, 1):
+        path = cells.folder / f"{name}-{SMALL}-{seed}.btf.zarr"
+        if not path.exists():
+            btf = synth_btf(name, size=SMALL, lights="25", views="25", seed=seed)
+            writer.write(btf, path)
+        tiles.append(btfkit.open(path))
+    cells.get(f"{name}-{model}-carried-{cpu:g}", lambda: onto_another(name, tiles, model, cpu))
+
+
+def onto_another(name: str, tiles: list[BTF], model: str, cpu: float) -> dict[str, Any]:
+    """PSNR of log(1 + rgb) on ten held-out pairs: own, and carried onto the second tile."""
+    import torch
+
+    from btfkit.fitting.loop import Run, train
+    from btfkit.fitting.neubtf.data import frontal_slice
+    from btfkit.materials import file
+    from btfkit.propagation import propagate
+
+    torch.set_num_threads(1)
+    own, other = tiles
+    rows, test = fitting.split(len(own), HOLDOUT, SEED)
+    trainable, generators = begun(own, model, rows, test)
+    run = Run(None, None, budget_cpu_s=cpu)
+    train(trainable, run, generators=generators)
+    material = trainable.material()
+    pairs = np.random.default_rng(1).permutation(test)[:10]
+    found: dict[str, Any] = {"steps": run.done}
+    found["own"] = evaluation.errors_on_btf(material, own, pairs=pairs)["psnr_log1p"]
+    flat = metrics.Pooled()
+    for pair in pairs:
+        truth = other.texture(int(pair))
+        flat.add(np.broadcast_to(truth.mean(axis=(0, 1)), truth.shape), truth)
+    found["mean_colour"] = flat.errors()["psnr_log1p"]
+    if not trainable.training_arrays():
+        return found
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "m.safetensors"
+        file.save(material, path, training=trainable.training_arrays())
+        guide = frontal_slice(other, rows).permute(1, 2, 0).numpy()
+        moved = propagate(guide, path, wrap="wrap")
+    errors = evaluation.errors_on_btf(moved, other, pairs=pairs)
+    found |= {"carried": errors["psnr_log1p"]}
+    found |= {key: errors[key] for key in ("ssim_srgb", "flip")} | trainable.stated()
+    if "texture.heights" in moved.weights:
+        heights = moved.weights["texture.heights"][..., 0].astype(float)
+        texels = heights * (moved.spec.depth_scale * SMALL)
+        truth = procedural.make(name, SMALL, seed=1).height * SMALL
+        found["height_error"], found["height"] = np.std(texels - truth), np.std(truth)
+    return found
+
+
+def begun(btf: BTF, model: str, rows: Any, test: Any) -> tuple[Any, Any]:
+    """A model before its first step."""
+    from btfkit.fitting import TRAINED
+    from btfkit.fitting.loop import Generators
+
+    module, name = TRAINED[model].split(":")
+    kind = getattr(importlib.import_module(module), name)
+    generators = Generators(SEED)
+    settings = {"levels": "1"} if model == "neumip" else {}
+    return kind(btf, rows, test, settings=settings, generators=generators), generators
 
 
 def spread(btf: BTF, model: Path) -> dict[str, Any]:
@@ -138,7 +210,7 @@ def propagation(cells: Cells, name: str, budget: float) -> None:
     whole = traced_btf(relief, light, view)
     crop = whole.crop(slice(0, 128), slice(0, 128))
     model = cells.folder / f"{name}-crop.safetensors"
-    cells.get(f"{name}-crop", lambda: fitted(crop, "neubtf", budget, model))
+    cells.get(f"{name}-crop", lambda: fitted(crop, "neubtf-paper", budget, model))
     cells.get(f"{name}-propagated", lambda: against_truth(whole, crop, model))
 
 
@@ -199,13 +271,18 @@ def main() -> None:
     parser.add_argument("--budget", type=float, default=600.0, help="seconds a fit")
     parser.add_argument("--free", type=float, default=300.0, help="seconds with free textures")
     parser.add_argument(
-        "--only", nargs="*", help="brick, gravel, woven, print, cobbles, propagation"
+        "--only", nargs="*", help="carried, brick, gravel, woven, print, cobbles, propagation"
     )
+    parser.add_argument("--cpu", type=float, default=36.0, help="CPU seconds a carried fit")
     parser.add_argument("--plot", type=Path)
     args = parser.parse_args()
     print(platform.processor() or platform.machine(), os.cpu_count(), "processors", flush=True)
     cells = Cells(args.out)
-    chosen = args.only or [*FLAT, *STEEP, "propagation"]
+    chosen = args.only or ["carried", *FLAT, *STEEP, "propagation"]
+    if "carried" in chosen:
+        for name in ("woven", "cobbles"):
+            for model in ("neubtf", "neubtf-paper", "neumip"):
+                carried(cells, name, model, args.cpu)
     for name, relief in FLAT.items():
         if name in chosen:
             compare(cells, name, relief, args.budget, args.free)

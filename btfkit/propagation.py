@@ -1,7 +1,7 @@
 """Propagation: a fitted NeuBTF carried onto another guidance image.
 
-The encoder reads the image and gives a neural texture of its size; with the renderer as it was
-fitted, that is a material of its own. Nothing is trained.
+The encoder reads the image and gives textures of its size; with the decoder as it was fitted,
+they are a material of its own. Nothing is trained.
 
 Source: Rodriguez-Pardo et al., "NeuBTF: Neural fields for BTF encoding and transfer",
 Computers & Graphics 114, 2023, sections 3.1 and 6.
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,17 +20,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from btfkit.btf import Wrap
+from btfkit.btf import BTF, Wrap
 from btfkit.errors import FitError, FormatError
 from btfkit.files import refuse_existing
 from btfkit.fitting.neubtf import augment
-from btfkit.fitting.neubtf.guides import encode
-from btfkit.fitting.neubtf.unet import Encoder
+from btfkit.fitting.neubtf.carrier import CARRIERS, errors_in
+from btfkit.fitting.neubtf.data import frontal_slice
+from btfkit.fitting.neubtf.guides import Window
 from btfkit.io import images
 from btfkit.materials import file
-from btfkit.materials.neubtf import NeuBTF
+from btfkit.materials.base import Header, Material
+from btfkit.materials.neubtf.material import AnyNeuBTF
 
 Array = NDArray[np.float32]
+Carried = Callable[[torch.Tensor, Header], AnyNeuBTF]
 # A guidance of more texels needs more memory for its encoder than most machines have.
 _MOST_TEXELS = 1 << 25
 _COMPARED = 256
@@ -46,7 +49,7 @@ def propagate(
     out: str | os.PathLike[str] | None = None,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
-) -> NeuBTF:
+) -> AnyNeuBTF:
     """The NeuBTF of `model` on another structure.
 
     Args:
@@ -67,7 +70,7 @@ def propagate(
         ValueError: a guidance with no size, too large, or with channels that no image has.
     """
     final = None if out is None else refuse_existing(out, force=force)
-    material, encoder, mean, deviation = _fitted(model)
+    material, onto = _fitted(model)
     image, name = _image(guidance)
     if progress:
         progress(1, 4)
@@ -81,20 +84,10 @@ def propagate(
     prepared = prepare(image, scale=scale, wrap=chosen == "wrap")
     if progress:
         progress(2, 4)
-    with torch.no_grad():
-        encoded = encode(encoder, prepared, wrap=chosen == "wrap")
-        texture = encoded[0].permute(1, 2, 0) * deviation + mean
-    h, w = texture.shape[:2]
-    weights = {
-        **material.weights,
-        "texture": texture.numpy().astype(material.weights["texture"].dtype),
-    }
-    if progress:
-        progress(3, 4)
     texel_mm = material.header.texel_mm
     header = replace(
         material.header,
-        grid=(h, w),
+        grid=(int(prepared.shape[2]), int(prepared.shape[3])),
         wrap=chosen,
         texel_mm=None if texel_mm is None else texel_mm / scale,
         provenance={
@@ -108,12 +101,41 @@ def propagate(
             },
         },
     )
-    carried = NeuBTF(replace(material.spec, size=(h, w)), weights, header)
+    carried = onto(prepared, header)
+    if progress:
+        progress(3, 4)
     if final is not None:
         file.save(carried, final, force=force)
     if progress:
         progress(4, 4)
     return carried
+
+
+def errors_carried(
+    model: str | os.PathLike[str],
+    btf: BTF,
+    *,
+    pairs: NDArray[np.intp] | None = None,
+    window: Sequence[int] | None = None,
+) -> dict[str, float]:
+    """Errors of what the encoder alone makes of a BTF's own mean frontal slice.
+
+    Args:
+        model: a NeuBTF file with its encoder. btf: data of the same kind of sample.
+        pairs: that are compared; None takes all.
+        window: top, left, height and width of the texels that are; None takes all.
+
+    Returns:
+        `psnr_carried` and `psnr_log1p_carried`; empty where nothing is measured.
+    """
+    _, onto = _fitted(model)
+    every = np.arange(len(btf))
+    chosen = every if pairs is None else pairs
+    rest = every if pairs is None or len(pairs) == len(btf) else np.setdiff1d(every, pairs)
+    frontal = augment.three_channels(frontal_slice(btf, rest))
+    carried = onto(augment.encoded(frontal)[None], Header.of(btf))
+    _, h, w, _ = btf.shape
+    return errors_in(carried, btf, chosen, Window(*(window or (0, 0, h, w))))
 
 
 def has_encoder(path: str | os.PathLike[str]) -> bool:
@@ -122,7 +144,7 @@ def has_encoder(path: str | os.PathLike[str]) -> bool:
         described = file.header_of(path)
     except (FormatError, OSError):
         return False
-    return described["model"] == "neubtf" and any(
+    return described["model"] in CARRIERS and any(
         name.startswith(file.TRAINING + "encoder.") for name in described["shapes"]
     )
 
@@ -195,35 +217,26 @@ def _middle(image: Array) -> Array:
     return image[top : top + _COMPARED, left : left + _COMPARED]
 
 
-def _fitted(
-    path: str | os.PathLike[str],
-) -> tuple[NeuBTF, Encoder, torch.Tensor, torch.Tensor]:
-    """A NeuBTF, its encoder, and the mean and deviation of its latents."""
+def _fitted(path: str | os.PathLike[str]) -> tuple[Material, Carried]:
+    """A NeuBTF, and how it is carried onto a guidance (1, 3, h, w) under a header."""
     material = file.load(path)
-    if not isinstance(material, NeuBTF):
+    if material.model not in CARRIERS:
         raise FitError(f"{os.fspath(path)} is a {material.model}; only a NeuBTF can be propagated")
     arrays = file.training_arrays(path)
-    weights = {
-        name.removeprefix("encoder."): torch.from_numpy(value)
-        for name, value in arrays.items()
-        if name.startswith("encoder.")
-    }
-    if not weights or "mean" not in arrays or "deviation" not in arrays:
+    if not any(name.startswith("encoder.") for name in arrays):
         raise FitError(
             f"{os.fspath(path)} has no encoder (a propagated NeuBTF has none)",
             remedy="name the model that was fitted",
         )
     _check_trained(path, material)
-    encoder = Encoder(material.spec.latents, torch.Generator())
     try:
-        encoder.load_state_dict(weights)
-    except RuntimeError as error:
+        carrier: Any = CARRIERS[material.model].of(arrays)
+    except (KeyError, RuntimeError, ValueError) as error:
         raise FormatError(path, f"the encoder does not fit this version ({error})") from error
-    mean, deviation = (torch.from_numpy(arrays[name]) for name in ("mean", "deviation"))
-    return material, encoder.eval(), mean, deviation
+    return material, lambda guidance, header: carrier.carried(material, guidance, header)
 
 
-def _check_trained(path: str | os.PathLike[str], material: NeuBTF) -> None:
+def _check_trained(path: str | os.PathLike[str], material: Material) -> None:
     """Refuse an encoder that was never trained, warn of one that hardly was."""
     parts = [str(part) for part in material.header.provenance.get("untrained", ())]
     encoder = next((part for part in parts if part.startswith("the encoder")), None)

@@ -49,6 +49,7 @@ def eval_verb(bar: Bar, *, model: Path, source: Path, everything: bool) -> Outco
     rows = None if everything or test is None else test
     bar.phase("evaluating")
     errors = _errors(material, truth, rows, bar)
+    errors |= _carried(model, material, truth, rows, test, errors)
     which = _which(material, truth, rows, test)
     line = "  ".join(f"{k} {v:.6g}" for k, v in errors.items() if isinstance(v, (int, float)))
     data: dict[str, Any] = {"model": model, "source": source, "which": which, **errors}
@@ -65,6 +66,27 @@ def _errors(material: Material, truth: BTF | QuerySet, rows: Any, bar: Bar) -> d
     if isinstance(truth, BTF):
         return evaluation.errors_on_btf(material, truth, pairs=rows, progress=bar)
     return evaluation.errors_on_queries(material, truth if rows is None else truth.subset(rows))
+
+
+def _carried(
+    path: Path, material: Material, truth: BTF | QuerySet, rows: Any, test: Any, errors: Any
+) -> dict[str, Any]:
+    """Of a NeuBTF with its encoder: what that alone makes of the mean frontal slice of the data."""
+    from btfkit.btf import BTF
+
+    if not material.model.startswith("neubtf") or not isinstance(truth, BTF):
+        return {}
+    from btfkit.propagation import errors_carried, has_encoder
+
+    known = material.header.provenance
+    begun = not any("not begun" in part for part in known.get("untrained", ()))
+    if not (begun and has_encoder(path)):
+        return {}
+    own = test is not None
+    window = known.get("stated", {}).get("carried_window") if own else None
+    found: dict[str, Any] = {"psnr_own": errors["psnr"]} if own else {}
+    found |= errors_carried(path, truth, pairs=rows, window=window)
+    return found | ({"carried_window": window} if window else {})
 
 
 def _which(material: Material, truth: BTF | QuerySet, rows: Any, test: Any) -> str:

@@ -139,7 +139,7 @@ def _next(report: FitReport) -> str:
     from btfkit.materials import PROGRAMS
 
     out = shlex.quote(report.out or "")
-    if report.material.model == "neubtf" and not report.untrained:
+    if report.material.model in ("neubtf", "neubtf-paper") and not report.untrained:
         return f"btfkit propagate guidance.png --model {out}"
     drawn = report.material.model in PROGRAMS and not report.material.has_curvature
     return f"btfkit view {out}" if drawn else f"btfkit render {out} --shape sphere"

@@ -95,11 +95,12 @@ def _tile_store(
 
 def _tile_model(path: Path, final: Path, force: bool) -> Tiling:
     from btfkit.materials import file
-    from btfkit.materials.neubtf import NeuBTF
+    from btfkit.materials.neubtf.material import NeuBTF
+    from btfkit.materials.neubtf.paper import NeuBTFPaper
     from btfkit.synthesis import tile_neubtf
 
     material = file.load(path)
-    if not isinstance(material, NeuBTF):
+    if not isinstance(material, (NeuBTF, NeuBTFPaper)):
         raise BtfkitError(
             f"{path} is a {material.model} model; of models only a NeuBTF can be tiled",
             remedy="tile the BTF store that it was fitted to, and fit that",

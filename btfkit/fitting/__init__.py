@@ -14,6 +14,7 @@ TRAINED: dict[str, str] = {
     "neumip-paper": "btfkit.fitting.neumip.paper:NeuMIPPaper",
     "sbtf": "btfkit.fitting.sbtf.trainable:SBTF",
     "neubtf": "btfkit.fitting.neubtf.trainable:NeuBTF",
+    "neubtf-paper": "btfkit.fitting.neubtf.paper:NeuBTFPaper",
 }
 # Models with a closed form: functions (source, *, settings, progress) -> Material.
 CLOSED_FORM: dict[str, str] = {
@@ -36,6 +37,7 @@ SETTINGS: dict[str, str] = {
     "neumip-paper": "btfkit.fitting.neumip.settings:Settings",
     "sbtf": "btfkit.fitting.sbtf.settings:Settings",
     "neubtf": "btfkit.fitting.neubtf.settings:Settings",
+    "neubtf-paper": "btfkit.fitting.neubtf.settings:PaperSettings",
 }
 
 

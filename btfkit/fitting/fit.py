@@ -112,6 +112,8 @@ def fit(
     try:
         limit = None if full_report else phases.evaluating_s()
         errors = _errors(material, data, plan, limit, progress)
+        if run.stated and "psnr" in errors:
+            errors = {**errors, "psnr_own": errors["psnr"], **run.stated}
     except KeyboardInterrupt:
         choice = (*choice, "not evaluated, because interrupted: btfkit eval does it")
     phases.end()
@@ -201,7 +203,8 @@ def _provenance(
         "steps": run.steps,
         "btfkit": importlib.metadata.version("btfkit"),
     }
-    return found | ({"untrained": list(run.untrained)} if run.untrained else {})
+    found |= {"untrained": list(run.untrained)} if run.untrained else {}
+    return found | ({"stated": dict(run.stated)} if run.stated else {})
 
 
 def _errors(

@@ -87,6 +87,10 @@ class Trainable(ABC):
         """Take what the relief behind the data tells; most models learn it from the data."""
         del relief
 
+    def stated(self) -> dict[str, Any]:
+        """Errors that only the training can tell, JSON types, by the report's keys."""
+        return {}
+
     def on_device(self, device: str) -> Trainable | None:
         """The same model trained on a torch device, or None where it knows the CPU alone."""
         del device

@@ -90,4 +90,6 @@ class FitReport:
             return "no held-out data"
         pairs, of = self.errors.get("pairs"), self.errors.get("of_pairs")
         some = f" ({pairs} of {of} pairs)" if pairs != of else ""
-        return f"held-out PSNR {psnr:.2f} dB{some}"
+        carried = self.errors.get("psnr_carried")
+        onto = "" if carried is None else f", carried onto unseen texels {carried:.2f} dB"
+        return f"held-out PSNR {psnr:.2f} dB{some}{onto}"

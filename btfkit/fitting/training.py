@@ -39,6 +39,7 @@ class Ran:
     training: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     device: str = "cpu"
     untrained: tuple[str, ...] = ()
+    stated: Mapping[str, Any] = field(default_factory=dict)
 
 
 @final
@@ -128,6 +129,7 @@ def trained(
     ran = Ran(
         run.elapsed_s, run.cpu_s, run.done, trainable.queries, tuple(run.curve),
         run.interrupted, trainable.training_arrays(), where, trainable.untrained(),
+        trainable.stated(),
     )  # fmt: skip
     return trainable.material(), ran
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from typing import Any
 
 MODELS: dict[str, str] = {
@@ -11,7 +12,8 @@ MODELS: dict[str, str] = {
     "pca": "btfkit.materials.measured.pca:PCA",
     "rainer19": "btfkit.materials.rainer:Rainer19",
     "rainer20": "btfkit.materials.rainer:Rainer20",
-    "neubtf": "btfkit.materials.neubtf:NeuBTF",
+    "neubtf": "btfkit.materials.neubtf.material:NeuBTF",
+    "neubtf-paper": "btfkit.materials.neubtf.paper:NeuBTFPaper",
     "neumip": "btfkit.materials.neumip.material:NeuMIP",
     "neumip-paper": "btfkit.materials.neumip.material:NeuMIPPaper",
     "sbtf": "btfkit.materials.sbtf.material:SBTF",
@@ -22,10 +24,20 @@ PROGRAMS: tuple[str, ...] = (
     "rainer19",
     "rainer20",
     "neubtf",
+    "neubtf-paper",
     "neumip",
     "neumip-paper",
     "sbtf",
 )
+
+
+def present_name(model: str, spec: Mapping[str, Any]) -> str:
+    """What a model of a file is called today: `neubtf` used to be the published one.
+
+    Args:
+        model: as the file names it. spec: as the file holds it.
+    """
+    return "neubtf-paper" if model == "neubtf" and "latents" in spec else model
 
 
 def material_class(model: str) -> Any:

@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 
 from btfkit.errors import FormatError
 from btfkit.files import whole
-from btfkit.materials import MODELS, material_class
+from btfkit.materials import MODELS, material_class, present_name
 from btfkit.materials.base import Header, Material
 
 VERSION = 1
@@ -90,12 +90,13 @@ def load(path: str | os.PathLike[str]) -> Material:
     """
     arrays, metadata = _read(path, want=lambda name: not name.startswith(TRAINING))
     try:
-        model = metadata["model"]
+        described = json.loads(metadata["spec"])
+        model = present_name(metadata["model"], described)
         if model not in MODELS:
             known = ", ".join(sorted(MODELS))
             raise FormatError(path, f"model {model!r}; this version knows {known}")
         kind = material_class(model)
-        spec = kind.spec_type(**_tuples(json.loads(metadata["spec"])))
+        spec = kind.spec_type(**_tuples(described))
         fields = {name: json.loads(metadata[name]) for name in Header.__dataclass_fields__}
         return kind(spec, arrays, Header(**_tuples(fields)))
     except (KeyError, TypeError, ValueError) as error:
@@ -117,6 +118,7 @@ def header_of(path: str | os.PathLike[str]) -> dict[str, Any]:
     for name in ("spec", *Header.__dataclass_fields__):
         if name in metadata:
             decoded[name] = json.loads(metadata[name])
+    decoded["model"] = present_name(metadata["model"], decoded.get("spec", {}))
     return decoded
 
 

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from btfkit import directions, metrics
 from btfkit.btf import BTF
+from btfkit.materials.base import Header
 from btfkit.materials.evaluation import texel_centres
-from btfkit.materials.neubtf import NeuBTF
+from btfkit.materials.neubtf.material import AnyNeuBTF, NeuBTF
+from btfkit.materials.neubtf.paper import NeuBTFPaper
 from btfkit.nearfield import directions_at, texel_places
 from btfkit.synthesis.drift import Drift
 from btfkit.synthesis.indexmap import IndexMap
@@ -150,10 +152,10 @@ def tile_btf(btf: BTF, *, drift: bool = True) -> tuple[BTF, Tiling]:
     return tile, replace(tiling, seam_ratio=_seam(tile, chosen), bent=change)
 
 
-def tile_neubtf(material: NeuBTF) -> tuple[NeuBTF, Tiling]:
-    """A NeuBTF as a tile: the map is found on what it answers and taken for its latents.
+def tile_neubtf(material: AnyNeuBTF) -> tuple[AnyNeuBTF, Tiling]:
+    """A NeuBTF as a tile: the map is found on what it answers and taken for its textures.
 
-    Latents are moved, never mixed or bent: between two materials there need not be a third.
+    Texels are moved, never mixed or bent: between two materials there need not be a third.
     """
     h, w = material.spec.size
     if material.header.wrap == "wrap":
@@ -167,9 +169,23 @@ def tile_neubtf(material: NeuBTF) -> tuple[NeuBTF, Tiling]:
         wrap="wrap",
         provenance={**material.header.provenance, "tiled": tiling.record()},
     )
-    weights = {**material.weights, "texture": tiling.index.of(material.weights["texture"])}
-    tile = NeuBTF(replace(material.spec, size=(p, q)), weights, header)
+    tile = _moved(material, tiling.index, header)
     return tile, replace(tiling, seam_ratio=_seam_of_answers(tile))
+
+
+def _moved(material: AnyNeuBTF, index: IndexMap, header: Header) -> AnyNeuBTF:
+    """A material whose finest textures are taken by a map."""
+    weights = dict(material.weights)
+    spec: Any = replace(material.spec, size=index.size)
+    if isinstance(material, NeuBTFPaper):
+        weights["texture"] = index.of(weights["texture"])
+        return NeuBTFPaper(spec, weights, header)
+    weights["texture.0.0"] = index.of(weights["texture.0.0"])
+    heights = index.of(weights["texture.heights"])
+    # In tile widths, and the tile is another.
+    ratio = np.float32(material.spec.size[1] / index.size[1])
+    weights["texture.heights"] = (heights.astype(np.float32) * ratio).astype(heights.dtype)
+    return NeuBTF.of_finest(spec, weights, header)
 
 
 def _tiling(summary: Summary) -> Tiling:
@@ -207,7 +223,7 @@ def _seam(btf: BTF, pairs: Sequence[int]) -> float:
     return float(np.mean([metrics.seam_ratio(btf.texture(i)) for i in pairs]))
 
 
-def _answers(material: NeuBTF) -> Iterator[Array]:
+def _answers(material: AnyNeuBTF) -> Iterator[Array]:
     """What a model answers at its texel centres under a few pairs."""
     table = directions.bonn81()
     light, view = np.tile(table, (len(table), 1)), np.repeat(table, len(table), axis=0)
@@ -216,5 +232,5 @@ def _answers(material: NeuBTF) -> Iterator[Array]:
         yield material.evaluate(uv, light[pair], view[pair]).reflectance
 
 
-def _seam_of_answers(material: NeuBTF) -> float:
+def _seam_of_answers(material: AnyNeuBTF) -> float:
     return float(np.mean([metrics.seam_ratio(answer) for answer in _answers(material)]))

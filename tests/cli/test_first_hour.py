@@ -35,7 +35,7 @@ from btfkit.queries import QuerySet
 from btfkit.relief import procedural
 from btfkit.textures import Textures
 
-QUICK = ("--set", "pairs=4", "--set", "texels=64")
+QUICK = ("--set", "batch=256")
 
 
 def sample(pairs: int = 40, size: int = 16) -> BTF:
@@ -243,11 +243,11 @@ class Counted(Textures):
         return self._btf.texture(index)
 
 
-@pytest.mark.parametrize("model", ["auto", "neubtf", "rainer19", "lambert"])
+@pytest.mark.parametrize("model", ["auto", "neubtf", "neubtf-paper", "rainer19", "lambert"])
 def test_no_texture_is_decoded_twice(model: str) -> None:
     btf = sample()
     counted = Counted(btf)
-    settings = {} if model in ("auto", "lambert") else {"pairs": 4, "texels": 32}
+    settings = {"pairs": 4, "texels": 32} if model in ("neubtf-paper", "rainer19") else {}
     fit(replace(btf, textures=counted), model=model, steps=2, settings=settings)
     assert sorted(counted.read) == list(range(40))
 
@@ -321,7 +321,7 @@ def test_an_interrupted_neubtf_says_what_is_not_trained_and_how_to_go_on(
     assert (report["steps"], report["interrupted"]) == (40, False)
     assert not (here / "wool.neubtf.safetensors.state").exists()
     # So few steps carry nothing: that is said, too, and propagation warns.
-    assert "steps of 200 at least; it carries poorly" in report["untrained"][0]
+    assert "steps of 100 at least; it carries poorly" in report["untrained"][0]
     capsys.readouterr()
     assert run(command, ["propagate", "guidance.png"]) == 0
     assert "it carries poorly" in capsys.readouterr().err
@@ -469,7 +469,7 @@ def test_a_state_that_cannot_be_written_costs_no_training(
         ({"holdout": 1.0}, "holdout = 1.0; expected 0 up to"),
         ({"device": "gpu"}, r"no device 'gpu'.*; there are auto, cpu, cuda"),
         ({"model": "neumop"}, r"no model 'neumop' \(did you mean neumip\?\); there are auto, "),
-        ({"settings": {"texls": 3}, "model": "neubtf", "steps": 1}, "did you mean texels"),
+        ({"settings": {"bach": 3}, "model": "neubtf", "steps": 1}, "did you mean batch"),
     ],
 )
 def test_python_checks_what_the_command_line_checks(options: dict[str, Any], message: str) -> None:

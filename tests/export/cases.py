@@ -6,7 +6,7 @@ import numpy as np
 
 from btfkit.materials.base import Header, Material
 from btfkit.materials.lambert import Lambert, LambertSpec
-from btfkit.materials.neubtf import NeuBTF, NeuBTFSpec
+from btfkit.materials.neubtf.paper import NeuBTFPaper, NeuBTFSpec
 from btfkit.materials.neumip.material import NeuMIP, NeuMIPPaper
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.materials.rainer import Rainer20, RainerSpec
@@ -23,7 +23,7 @@ SPECS = {
     "neumip-clamped": (NeuMIP, NeuMIPSpec(GRID, levels=1, features=8, output="relu"), "clamp"),
     "neumip-paper": (NeuMIPPaper, NeuMIPSpec(GRID, levels=3, output="released"), "wrap"),
     # Sines of less than 2.5 times their sums: at random these double rounding layer by layer.
-    "neubtf": (NeuBTF, NeuBTFSpec((16, 24), omega=1.25, parallax=True), "wrap"),
+    "neubtf-paper": (NeuBTFPaper, NeuBTFSpec((16, 24), omega=1.25, parallax=True), "wrap"),
     "rainer20": (Rainer20, RainerSpec((8, 12), latents=32, whitened=True), "clamp"),
 }
 
@@ -38,7 +38,7 @@ def made(name: str, *, seed: int = 0) -> Material:
         if part.startswith("texture"):
             # A sine doubles what rounding does to a place between texels that differ much.
             # A ray that grazes heights is as ill-conditioned as these are rough.
-            spread = 0.1 if name == "neubtf" or part == "texture.heights" else 0.5
+            spread = 0.1 if name == "neubtf-paper" or part == "texture.heights" else 0.5
             value = rng.random(shape) if name == "lambert" else rng.normal(0, spread, shape)
         elif part.endswith("norm.weight"):
             value = rng.uniform(0.1, 0.3, shape)

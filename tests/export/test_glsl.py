@@ -122,7 +122,7 @@ def test_a_shader_answers_as_the_program_of_its_textures(
     np.testing.assert_allclose(found[:, 3], np.where(up, opacity, 0), atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["neumip", "neubtf"])
+@pytest.mark.parametrize("name", ["neumip", "neubtf-paper"])
 def test_the_example_draws_the_material_without_a_complaint(name: str, tmp_path: Path) -> None:
     export(made(name), "glsl", tmp_path / "out")
     picture = tmp_path / "seen.png"

@@ -1,4 +1,4 @@
-"""NeuBTF: its size, its twins, its fit, and guidance images of every kind."""
+"""NeuBTF with heights: what is taught, what is kept from it, and what a guidance becomes."""
 
 from __future__ import annotations
 
@@ -8,29 +8,34 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import btfkit
-from btfkit import directions, propagation
+from btfkit import propagation
 from btfkit.btf import BTF
 from btfkit.errors import FitError, FormatError
-from btfkit.fitting import fit, loop, losses
-from btfkit.fitting.neubtf import augment, guides, siren
-from btfkit.fitting.neubtf import data as neubtf_data
+from btfkit.fitting import fit, loop
+from btfkit.fitting.neubtf import augment, carrier, muon
+from btfkit.fitting.neubtf import encoder as encoders
+from btfkit.fitting.neubtf import paper as published
 from btfkit.fitting.neubtf import trainable as neubtf
-from btfkit.fitting.neubtf.siren import Renderer
-from btfkit.fitting.neubtf.unet import STRIDE, Encoder
-from btfkit.io import images
-from btfkit.materials.neubtf import NeuBTFSpec, renderer_shapes
-from btfkit.native.neural.plain import on_disc
+from btfkit.fitting.neubtf.data import frontal_slice
+from btfkit.fitting.neubtf.encoder import STRIDE, Encoder
+from btfkit.footprint import gaussian
+from btfkit.materials import file
+from btfkit.materials.evaluation import texel_centres
+from btfkit.materials.neubtf.material import NeuBTF
+from btfkit.materials.neubtf.paper import NeuBTFPaper
 from btfkit.relief.synth import synth_btf
+from btfkit.synthesis import tile_neubtf
 
-TINY: dict[str, str] = {"texels": "64", "pairs": "4"}
+TINY: dict[str, str] = {"batch": "1024"}
+STEPS = 160
+# Nothing but the encoder says what is carried.
+UNTIED = TINY | {"tied": "0", "free": "0.6"}
+UNTIED_STEPS = 260
 
 
 def generator() -> torch.Generator:
@@ -39,306 +44,244 @@ def generator() -> torch.Generator:
 
 @pytest.fixture(scope="module")
 def tiny() -> BTF:
-    return synth_btf("knit", size=32, lights="7", views="3", samples=2)
+    lazy = synth_btf("woven", size=32, lights="9", views="9", samples=2)
+    return replace(lazy, textures=lazy.textures.batch(range(len(lazy))))
 
 
 @pytest.fixture(scope="module")
 def fitted(tiny: BTF, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("model") / "tiny.neubtf.safetensors"
-    with pytest.MonkeyPatch.context() as patch:
-        # Too few steps to carry well, and enough for the laws below.
-        patch.setattr(neubtf, "_LEAST_TAUGHT", 1)
-        fit.fit(tiny, model="neubtf", steps=60, out=out, settings=TINY)
+    fit.fit(tiny, model="neubtf", steps=STEPS, out=out, settings=TINY)
     return out
 
 
-def test_the_renderer_has_3011_weights() -> None:
-    spec = NeuBTFSpec((4, 4))
-    assert sum(math.prod(shape) for shape in renderer_shapes(spec).values()) == 3011
-    renderer = Renderer(spec, generator())
-    assert sum(p.numel() for p in renderer.parameters()) == 3011
-    assert {n: tuple(a.shape) for n, a in renderer.arrays().items()} == renderer_shapes(spec)
+@pytest.fixture(scope="module")
+def untied(tiny: BTF, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("model") / "untied.neubtf.safetensors"
+    fit.fit(tiny, model="neubtf", steps=UNTIED_STEPS, out=out, settings=UNTIED)
+    return out
 
 
-@pytest.mark.parametrize("parallax", ["false", "true"])
-@pytest.mark.parametrize("wrap", ["wrap", "clamp"])
-def test_numpy_answers_as_torch_does(parallax: str, wrap: Any) -> None:
-    btf = replace(synth_btf("woven", size=16, lights="5", views="4", samples=1), wrap=wrap)
-    settings = TINY | {"parallax": parallax, "encoder": "false", "precision": "float32"}
-    trainable = neubtf.NeuBTF(
-        btf, np.arange(18), np.arange(18, 20), settings=settings, generators=loop.Generators(1)
-    )
-    for index in range(5):
-        trainable.step(index / 5)
-    material = trainable.material()
-    rows, cols = np.divmod(np.arange(256), 16)
-    for pair in (3, 11, 19):
-        with torch.no_grad():
-            ours = trainable._predict(
-                trainable._texture(),
-                np.array([pair]),
-                torch.from_numpy(rows),
-                torch.from_numpy(cols),
-                (16, 16),
-            )
-        uv = np.stack([(cols + 0.5) / 16, (rows + 0.5) / 16], -1)
-        rgb = material.evaluate(uv, btf.light[pair], btf.view[pair]).reflectance
-        # float32 through three sine layers
-        np.testing.assert_allclose(rgb, np.maximum(np.expm1(ours[0].numpy()), 0), atol=2e-5)
+@pytest.fixture(scope="module")
+def sharp(tiny: BTF) -> NeuBTF:
+    """A material of good textures, whatever its encoder."""
+    settings = TINY | {"free": "0.98", "kept": "false"}
+    material = fit.fit(tiny, model="neubtf", steps=600, settings=settings, holdout=0.0).material
+    assert isinstance(material, NeuBTF)
+    return material
 
 
-@given(st.floats(0, math.pi / 2), st.floats(-math.pi, math.pi))
-def test_directions_lie_on_the_disc_by_their_angle(theta: float, phi: float) -> None:
-    direction = directions.from_angles(theta, phi)[None].astype(np.float32)
-    expected = 2 / math.pi * theta * np.array([math.cos(phi), math.sin(phi)])
-    # float32
-    np.testing.assert_allclose(on_disc(direction)[0], expected, atol=1e-6)
-    np.testing.assert_allclose(siren.on_disc(torch.from_numpy(direction))[0], expected, atol=1e-6)
+def begun(btf: BTF, **settings: str) -> neubtf.NeuBTF:
+    n = len(btf)
+    return neubtf.NeuBTF(
+        btf, np.arange(n - 4), np.arange(n - 4, n), settings=TINY | settings,
+        generators=loop.Generators(0),
+    )  # fmt: skip
 
 
-def test_texel_centres_answer_their_own_texel_and_between_them_latents_mix(fitted: Path) -> None:
-    material: Any = btfkit.load(fitted)
-    h, w = material.header.grid
-    texture = material.weights["texture"].astype(np.float32)
-    found = material._lookup(
-        np.float32([[(5 + 0.5) / w, (9 + 0.5) / h], [5 / w + 1 / w, (9 + 0.5) / h]])
-    )
-    # texel positions in float32
-    np.testing.assert_allclose(found[0], texture[9, 5], atol=1e-3)
-    np.testing.assert_allclose(found[1], (texture[9, 5] + texture[9, 6]) / 2, atol=1e-3)
+def guidance_of(btf: BTF) -> torch.Tensor:
+    return augment.encoded(frontal_slice(btf, np.arange(len(btf))))[None]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_gradients_of_the_losses_are_right_in_float64(seed: int) -> None:
-    rng = torch.Generator().manual_seed(seed)
-    predicted = torch.rand(1, 3, 6, 6, dtype=torch.float64, generator=rng, requires_grad=True)
-    target = torch.rand(1, 3, 6, 6, dtype=torch.float64, generator=rng)
-    torch.autograd.gradcheck(lambda p: losses.log_l1(p, target), (predicted,))
-    # The frequency weights are constants by definition: compare with them frozen.
-    loss = losses.focal_frequency(predicted, target)
-    loss.backward()
-    assert predicted.grad is not None
-    assert torch.isfinite(predicted.grad).all()
-
-
-def test_group_21_equal_images_have_no_frequency_loss_and_no_nan_gradient() -> None:
-    image = torch.rand(1, 3, 8, 8, generator=generator(), requires_grad=True)
-    loss = losses.focal_frequency(image, image.detach().clone())
-    loss.backward()
-    assert float(loss.detach()) == 0
-    assert image.grad is not None
-    assert (image.grad == 0).all()
-
-
-def test_group_22_style_is_zero_for_equal_finite_for_constant_and_feels_structure() -> None:
-    style = losses.Style(3)
-    noise = torch.rand(1, 3, 32, 32, generator=generator())
-    assert float(style(noise, noise)) == 0
-    constant = torch.full((1, 3, 32, 32), 0.5)
-    assert math.isfinite(float(style(constant, constant * 0)))
-    shifted, blurred = noise.roll(5, 3), augment.resized(noise, (8, 8), wrap=False)
-    blurred = augment.resized(blurred, (32, 32), wrap=True)
-    assert float(style(shifted, noise)) < 0.2 * float(style(blurred, noise))
-    large = torch.full((1, 3, 8, 8), 1e4)
-    assert math.isfinite(float(style(large, large / 2)))
-
-
-def test_group_16_texels_that_are_not_measured_count_nothing() -> None:
-    predicted = torch.zeros(4, requires_grad=True)
-    loss = losses.log_l1(predicted, torch.tensor([1.0, np.nan, np.inf, -5.0]))
-    loss.backward()
-    # log 2, and -0.1 as the floor of dark-subtracted values
-    assert float(loss.detach()) == pytest.approx((math.log(2) - math.log(0.9)) / 2)
-    assert predicted.grad is not None
-    assert predicted.grad.tolist() == [-0.5, 0, 0, 0.5]
-    assert float(losses.log_l1(predicted.detach(), torch.full((4,), np.nan))) == 0
+# --- the encoder and what moves it ---------------------------------------------------------------
 
 
 def test_the_encoder_moves_with_the_image_by_multiples_of_its_stride() -> None:
-    encoder = Encoder(14, generator()).eval()
-    guide = torch.rand(1, 3, 32, 48, generator=generator())
+    encoder = Encoder(4, 7, generator()).eval()
+    guide = torch.rand(1, 4, 32, 48, generator=generator())
     with torch.no_grad():
         shifted = encoder(guide.roll((STRIDE, 3 * STRIDE), (2, 3)))
         ours = encoder(guide).roll((STRIDE, 3 * STRIDE), (2, 3))
     # float32 sums in another order
-    torch.testing.assert_close(shifted, ours, atol=1e-4, rtol=1e-4)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 40), (7, 13), (31, 64), (100, 36)])
-def test_group_12_any_guidance_size_is_encoded_and_stays_periodic(size: tuple[int, int]) -> None:
-    encoder = Encoder(14, generator()).eval()
-    guide = torch.rand(1, 3, *size, generator=generator())
-    with torch.no_grad():
-        texture = guides.encode(encoder, guide, wrap=True)
-        assert texture.shape == (1, 14, *size)
-        twice = guides.encode(encoder, guide.repeat(1, 1, 2, 2), wrap=True)
-    if all(side % STRIDE == 0 for side in size):
-        # float32 through the encoder.
-        torch.testing.assert_close(twice, texture.repeat(1, 1, 2, 2), atol=1e-3, rtol=1e-3)
-    assert torch.isfinite(texture).all()
-
-
-def test_the_encoder_refuses_what_its_stride_does_not_divide() -> None:
+    torch.testing.assert_close(shifted, ours, atol=1e-5, rtol=1e-4)
     with pytest.raises(ValueError, match=r"guidance of 12 x 16; expected multiples of 8"):
-        Encoder(14, generator())(torch.zeros(1, 3, 12, 16))
+        encoder(torch.zeros(1, 4, 12, 16))
 
 
-def test_resampling_a_periodic_image_keeps_it_periodic() -> None:
-    x = torch.sin(2 * math.pi * torch.arange(10) / 10).expand(1, 1, 10, 10)
-    grown = augment.resized(x, (10, 25), wrap=True)[0, 0, 0]
-    at = (torch.arange(25) + 0.5) * 10 / 25 - 0.5
-    # linear interpolation of a sine of ten samples: (pi / 10)^2 / 2
-    torch.testing.assert_close(grown, torch.sin(2 * math.pi * at / 10), atol=0.05, rtol=0)
+@pytest.mark.parametrize("wrap", [True, False])
+def test_guidance_encoded_in_parts_is_guidance_encoded_whole(
+    wrap: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encoder = Encoder(4, 7, generator()).eval()
+    guide = torch.rand(1, 4, 96, 144, generator=generator())
+    with torch.no_grad():
+        whole = encoders.encode_in_tiles(encoder, guide, wrap=wrap)
+        monkeypatch.setattr(encoders, "_PART", 64)
+        parts = encoders.encode_in_tiles(encoder, guide, wrap=wrap)
+    # float32 sums in another order; a reach too short would show at parts' edges
+    torch.testing.assert_close(parts, whole, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("channels", [1, 2, 3, 7])
-def test_data_of_any_number_of_channels_guide_and_are_fitted(channels: int) -> None:
-    rng = np.random.default_rng(0)
-    light = rng.normal(size=(8, 3)) + [0, 0, 4]
-    btf = BTF(
-        rng.random((8, 16, 16, channels), np.float32), light, np.tile([0, 0, 1.0], (8, 1)),
-        channels=tuple(str(400 + 30 * i) for i in range(channels)),
-    )  # fmt: skip
-    report = fit.fit(btf, model="neubtf", steps=6, settings=TINY)
-    assert report.material.evaluate([0.5, 0.5], [0, 0, 1], [0, 0, 1]).reflectance.shape == (
-        channels,
+@pytest.mark.parametrize("shape", [(24, 144), (96, 72), (7, 7)])
+def test_muon_moves_along_matrices_whose_singular_values_lie_near_one(
+    shape: tuple[int, int],
+) -> None:
+    matrix = torch.randn(shape, generator=generator(), dtype=torch.float64)
+    found = muon.orthogonalised(matrix)
+    values = torch.linalg.svdvals(found)
+    # the quintic of the source ends between 0.68 and 1.13 for all but the least values
+    assert values.max() < 1.3
+    assert values.median() > 0.6
+    left, _, right = torch.linalg.svd(matrix, full_matrices=False)
+    # same singular vectors: what is left beside the diagonal is rounding
+    inner = left.T @ found @ right.T
+    assert (inner - torch.diag(inner.diag())).abs().max() < 1e-6
+    assert (muon.orthogonalised(torch.zeros(3, 4)) == 0).all()
+
+
+# --- the two parts -------------------------------------------------------------------------------
+
+
+def test_features_are_tied_to_the_colours_of_the_guidance(tiny: BTF) -> None:
+    model = begun(tiny)
+    wanted = carrier.tied_features(model._guidance, model._axes).numpy()
+    # the first of the axes sees most of what varies
+    assert wanted[..., 0].std() >= wanted[..., 1].std() > 0
+    for index in range(6):
+        model.step(0.3 * index / 5)
+        features = model.material().weights["texture.0.0"]
+        # float16
+        np.testing.assert_allclose(features[..., 6:], wanted, atol=2e-3)
+
+
+def test_a_quarter_is_kept_from_the_encoder_until_it_has_been_measured(tiny: BTF) -> None:
+    model = begun(tiny)
+    model.step(0.0)
+    model.step(0.27)
+    assert model._kept == (8, 8, 16, 16)
+    aim = model._wanted
+    assert aim is not None
+    guide = whole(model._guides).draw()
+    _, counts = model._lesson(guide, aim)
+    assert counts.sum() == 32 * 32 - 16 * 16
+    assert model.stated() == {}
+    model.step(0.95)
+    assert model.stated()["carried_window"] == [8, 8, 16, 16]
+    _, counts = model._lesson(guide, aim)
+    assert counts.sum() == 32 * 32
+    small = tiny.crop(slice(0, 24), slice(0, 24))
+    assert begun(small)._kept is None
+
+
+def whole(guides: Any) -> Any:
+    """The same guides, unmoved."""
+    guides._window = lambda: neubtf.Window(0, 0, 32, 32)
+    return guides
+
+
+def test_what_counts_for_the_answer_counts_in_the_teaching(tiny: BTF) -> None:
+    model = begun(tiny)
+    for index in range(30):
+        model.step(0.2 * index / 30)
+    layout = model.free.layout
+    weights, _ = model.free.engine.parameters()
+    _, decoder = layout.split(weights)
+    # A decoder that does not read a feature: neither itself nor through a frame.
+    layout.decoder.layers(decoder)[0][0][:, 1] = 0
+    layout.decoder.layers(decoder)[0][0][:, 8:10] = 0
+    model._aim()
+    assert model._weight[2] < 1e-6
+    assert (model._weight[[0, 4, 5, 6]] > 1e-5).all()
+    torch.testing.assert_close(model._weight.sum(), torch.tensor(1.0))
+
+
+def test_an_encoder_that_learns_nothing_shows_in_what_is_carried_and_not_in_its_own(
+    tiny: BTF, untied: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = json.loads(untied.with_name("untied.neubtf.report.json").read_text())
+    monkeypatch.setattr(neubtf.NeuBTF, "_optimise", lambda *_: None)
+    failed = fit.fit(tiny, model="neubtf", steps=UNTIED_STEPS, settings=UNTIED).errors
+    assert failed["psnr_own"] == good["psnr_own"] == good["psnr"]
+    # an encoder that gives the mean texture everywhere has lost all structure
+    assert good["psnr_carried"] > failed["psnr_carried"] + 1
+
+
+def test_a_corrupted_encoder_shows_in_an_evaluation(
+    tiny: BTF, untied: Path, tmp_path: Path
+) -> None:
+    arrays = file.training_arrays(untied)
+    name = "encoder.out.weight"
+    arrays[name] = np.random.default_rng(0).permuted(arrays[name], axis=1)
+    file.save(btfkit.load(untied), tmp_path / "bad.safetensors", training=arrays)
+    test = btfkit.split(len(tiny))[1]
+    good, bad = (
+        propagation.errors_carried(path, tiny, pairs=test)
+        for path in (untied, tmp_path / "bad.safetensors")
     )
+    assert good["psnr_carried"] > bad["psnr_carried"] + 1
+    assert set(good) == {"psnr_carried", "psnr_log1p_carried"}
 
 
-@pytest.mark.slow
-def test_a_fit_beats_lambert_on_a_tiny_btf() -> None:
-    tiny = synth_btf("scratched", size=32, lights="25", views="9", samples=2, relief_texels=0.1)
-    settings = {"encoder": "false", "texels": "256"}
-    report = fit.fit(tiny, model="neubtf", steps=600, settings=settings)
-    lambert = fit.fit(tiny, model="lambert")
-    # gloss that lambert cannot hold: a tenth of its error in 600 steps
-    assert report.errors["mse"] < 0.3 * lambert.errors["mse"]
+def test_eval_states_own_and_carried(
+    tiny: BTF, fitted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from btfkit.cli import btfkit as group
+    from btfkit.cli.outcome import run
+    from btfkit.io.store import writer
+
+    store = writer.write(tiny, tmp_path / "a.btf.zarr", dtype="float32")
+    assert run(group, ["eval", str(fitted), str(store), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["psnr_own"] == found["psnr"]
+    assert found["carried_window"] == [8, 8, 16, 16]
+    assert 10 < found["psnr_carried"] < 60
 
 
-def test_first_latents_are_principal_components_of_what_was_measured() -> None:
-    rng = np.random.default_rng(0)
-    maps = rng.normal(size=(2, 8 * 9))
-    maps -= maps.mean(axis=1, keepdims=True)
-    weights = rng.normal(size=(40, 2, 3))
-    logs = 2 + 0.1 * np.einsum("nkc,kt->ntc", weights, maps).reshape(40, 8, 9, 3)
-    images = np.expm1(logs).astype(np.float32)
-    latents = neubtf_data.first_latents(images, 14, deviation=0.5, seed=0).numpy()
-    assert latents.shape == (72, 14)
-    # two maps span the data: two components hold them, the rest are small noise
-    np.testing.assert_allclose(latents[:, :2].std(axis=0), 0.5, atol=1e-5)
-    assert latents[:, 2:].std() < 0.02
-    solved = np.linalg.lstsq(latents[:, :2], maps.T, rcond=None)[0]
-    # float32
-    np.testing.assert_allclose(latents[:, :2] @ solved, maps.T, atol=1e-3)
-    images[3, 2, 2] = np.nan
-    images[:, 5, 5] = np.nan
-    found = neubtf_data.first_latents(images, 4, deviation=0.5, seed=0)
-    assert torch.isfinite(found).all()
-    flat = neubtf_data.first_latents(np.ones((3, 2, 2, 1)), 4, deviation=0.5, seed=0)
-    assert flat.abs().max() < 0.1
-
-
-def test_equal_seed_and_steps_give_equal_bytes(tiny: BTF, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        fit.fit(
-            tiny,
-            model="neubtf",
-            steps=20,
-            out=tmp_path / f"{name}.safetensors",
-            settings=TINY,
-            seed=3,
-        )
-    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
-
-
-@pytest.mark.slow
-def test_a_resumed_fit_takes_the_same_trajectory(
+def test_equal_seed_and_steps_give_equal_bytes_and_resume_goes_the_same_way(
     tiny: BTF, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, part = tmp_path / "whole.safetensors", tmp_path / "part.safetensors"
-    fit.fit(tiny, model="neubtf", steps=30, out=whole, settings=TINY)
-    original = neubtf.NeuBTF.step
-    monkeypatch.setattr(neubtf.NeuBTF, "step", _interrupted_after(original, 17))
-    report = fit.fit(tiny, model="neubtf", steps=30, out=part, settings=TINY)
-    assert report.interrupted
-    assert part.is_file()
-    assert report.steps == 17
-    monkeypatch.setattr(neubtf.NeuBTF, "step", original)
-    report = fit.fit(tiny, model="neubtf", steps=30, out=part, settings=TINY, resume=True)
-    assert (report.steps, report.interrupted) == (30, False)
-    for name, array in btfkit.load(whole).weights.items():
-        np.testing.assert_array_equal(array, btfkit.load(part).weights[name])
-    assert not (tmp_path / "part.safetensors.state").exists()
+    whole, again, part = (tmp_path / f"{name}.safetensors" for name in ("a", "b", "c"))
+    for out in (whole, again):
+        fit.fit(tiny, model="neubtf", steps=40, out=out, settings=TINY, seed=3)
+    assert whole.read_bytes() == again.read_bytes()
+    original, taken = neubtf.NeuBTF.step, [0]
 
-
-def _interrupted_after(step: Any, count: int) -> Any:
-    taken = []
-
-    def wrapped(self: Any, progress: float) -> float:
-        if len(taken) == count:
+    def stopping(self: Any, progress: float) -> float:
+        taken[0] += 1
+        if taken[0] == 25:
             raise KeyboardInterrupt
-        taken.append(progress)
-        return step(self, progress)
+        return original(self, progress)
 
-    return wrapped
-
-
-def test_group_24_a_diverging_loss_is_rolled_back_and_then_an_error(
-    tiny: BTF, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    original = neubtf.NeuBTF.step
-    calls = []
-
-    def once(self: Any, progress: float) -> float:
-        calls.append(progress)
-        return math.nan if len(calls) == 10 else original(self, progress)
-
-    monkeypatch.setattr(neubtf.NeuBTF, "step", once)
-    report = fit.fit(tiny, model="neubtf", steps=20, settings=TINY)
-    assert np.isfinite(report.errors["mse"])
-    monkeypatch.setattr(neubtf.NeuBTF, "step", lambda self, progress: math.inf)
-    with pytest.raises(FitError, match="neubtf diverges: loss inf at step 4"):
-        fit.fit(tiny, model="neubtf", steps=20, settings=TINY)
+    monkeypatch.setattr(neubtf.NeuBTF, "step", stopping)
+    report = fit.fit(tiny, model="neubtf", steps=40, out=part, settings=TINY, seed=3)
+    assert report.interrupted
+    monkeypatch.setattr(neubtf.NeuBTF, "step", original)
+    fit.fit(tiny, model="neubtf", steps=40, out=part, settings=TINY, seed=3, resume=True)
+    ours, theirs = file.training_arrays(whole), file.training_arrays(part)
+    for name, array in (btfkit.load(whole).weights | ours).items():
+        np.testing.assert_array_equal(array, (btfkit.load(part).weights | theirs)[name])
 
 
-def test_group_24_no_steps_one_pair_and_one_texel_still_end_in_a_model(tiny: BTF) -> None:
-    assert fit.fit(tiny, model="neubtf", steps=0).steps == 0
-    one = tiny.subset([4])
-    report = fit.fit(one, model="neubtf", steps=3, settings=TINY)
-    assert report.errors == {}
+def test_group_24_no_steps_one_pair_one_texel_and_no_test_still_end_in_a_model(tiny: BTF) -> None:
+    assert fit.fit(tiny, model="neubtf", steps=0).untrained
+    assert fit.fit(tiny.subset([4]), model="neubtf", steps=6, settings=TINY).errors == {}
     texel = tiny.crop(slice(3, 4), slice(5, 6))
-    report = fit.fit(texel, model="neubtf", steps=3, settings=TINY)
-    assert np.isfinite(report.errors["mse"])
+    for btf, options in ((texel, {}), (tiny, {"holdout": 0.0})):
+        report = fit.fit(btf, model="neubtf", steps=6, settings=TINY, **options)
+        uv = np.random.default_rng(0).random((9, 2))
+        answer = report.material.evaluate(uv, [0.5, 0, 0.8], [0, 0.6, 0.8]).reflectance
+        assert np.isfinite(answer).all()
+        assert "psnr_carried" not in report.errors
 
 
 def test_texels_that_are_not_measured_are_masked_and_counted(tiny: BTF) -> None:
-    textures = np.stack([tiny.texture(i) for i in range(len(tiny))])
-    textures[:, 3:9, 4:8] = np.nan
-    textures[5, 20, 20] = np.inf
-    report = fit.fit(replace(tiny, textures=textures), model="neubtf", steps=12, settings=TINY)
-    assert report.masked_texels >= 6 * 4 * (len(tiny) - 2)
-    assert np.isfinite(report.errors["mse"])
-    with pytest.raises(FitError, match="no texel of any texture is measured"):
-        fit.fit(replace(tiny, textures=np.full_like(textures, np.nan)), model="neubtf", steps=2)
-
-
-def test_values_past_half_range_are_fitted_in_float32(tiny: BTF) -> None:
-    textures = np.stack([tiny.texture(i) for i in range(len(tiny))]) * 1e5
-    report = fit.fit(replace(tiny, textures=textures), model="neubtf", steps=5, settings=TINY)
-    assert np.isfinite(report.errors["mse"])
+    values = np.array(tiny.textures, np.float32)
+    values[:, 3:9, 4:8] = np.nan
+    report = fit.fit(replace(tiny, textures=values), model="neubtf", steps=24, settings=TINY)
+    assert report.masked_texels >= 24 * (len(tiny) - 8)
+    assert math.isfinite(report.errors["psnr_carried"])
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (
-            {"omegas": "3"},
-            r"no setting omegas \(did you mean omega\?\); it has omega, latents, encoder, parallax",
-        ),
+        ({"frontals": "3"}, r"no setting frontals \(did you mean frontal\?\); it has scales"),
         ({"precision": "int8"}, "precision = 'int8'; expected float16 or float32"),
-        ({"first": "0.9", "second": "0.2"}, "they must leave a rest"),
-        ({"scales": "0"}, "scales = 0.0; expected 0 to 1"),
-        ({"pairs": "0"}, "must be at least 1"),
+        ({"free": "1"}, "free = 1.0; expected more than 0 and less than 1"),
+        ({"tied": "3"}, "tied = 3; expected 0 to 2"),
+        ({"rate": "0"}, "rate = 0.0; expected more than 0, up to 1"),
+        ({"frontal": "2"}, "frontal = 2.0; expected 0 to 1"),
+        ({"crop": "0"}, "crop and pool_mb must be at least 1"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(
@@ -348,177 +291,114 @@ def test_settings_that_make_no_sense_are_refused(
         fit.fit(tiny, model="neubtf", steps=1, settings=given)
 
 
-@pytest.mark.parametrize("holdout", [-0.1, 1.0])
-def test_a_holdout_that_leaves_nothing_is_refused(tiny: BTF, holdout: float) -> None:
-    with pytest.raises(ValueError, match="expected 0 up to, but not, 1"):
-        fit.fit(tiny, model="neubtf", steps=1, holdout=holdout)
+# --- other guidance ------------------------------------------------------------------------------
 
 
-@given(st.integers(2, 500), st.floats(0.01, 0.4), st.integers(0, 9))
-@settings(max_examples=30)
-def test_training_and_test_pairs_are_disjoint_complete_and_repeatable(
-    n: int, share: float, seed: int
+def test_a_guidance_repeated_is_the_material_repeated_heights_and_all(
+    tiny: BTF, fitted: Path
 ) -> None:
-    train, test = fit.split(n, share, seed)
-    assert sorted([*train, *test]) == list(range(n))
-    assert len(test) == max(1, round(share * n))
-    np.testing.assert_array_equal(train, fit.split(n, share, seed)[0])
+    picture = guidance_of(tiny)[0].permute(1, 2, 0).numpy() ** 2.2
+    one = propagation.propagate(picture, fitted, wrap="wrap")
+    four = propagation.propagate(np.tile(picture, (2, 2, 1)), fitted, wrap="wrap")
+    heights = [m.weights["texture.heights"].astype(np.float32) for m in (one, four)]
+    assert np.ptp(heights[0]) > 0
+    # float16, in tile widths
+    np.testing.assert_allclose(heights[1][:32, :32], heights[0] / 2, atol=1e-3)
+    rng = np.random.default_rng(0)
+    uv, light, view = rng.random((200, 2)), [0.3, 0.2, 0.9], [-0.5, 0.3, 0.8]
+    answers = [m.evaluate(at, light, view).reflectance for m, at in ((one, uv), (four, uv / 2))]
+    # heights and features in float16, magnified where a ray grazes
+    assert np.abs(answers[0] - answers[1]).mean() < 2e-3
 
 
-def test_the_report_stands_beside_the_model(fitted: Path) -> None:
-    report = json.loads(fitted.with_name("tiny.neubtf.report.json").read_text())
-    for key in ("mse", "psnr", "mse_log1p", "psnr_log1p", "mae", "psnr_srgb", "ssim_srgb", "flip"):
-        assert math.isfinite(report[key])
-    assert (report["steps"], report["parameters"]) == (60, 3011)
-    header = btfkit.load(fitted).header
-    assert header.steps == 60
-    assert header.provenance["data"]["synthetic"] is True
+def test_guidance_of_any_size_and_scale_is_carried(fitted: Path) -> None:
+    rng = np.random.default_rng(0)
+    for size in ((1, 1), (7, 40), (33, 17)):
+        for wrap in ("wrap", "clamp"):
+            picture = rng.random((*size, 3)).astype(np.float32)
+            carried = propagation.propagate(picture, fitted, wrap=wrap)  # type: ignore[arg-type]
+            assert carried.header.grid == size
+            answer = carried.evaluate(rng.random((20, 2)), [0, 0.3, 0.9], [0.2, 0, 0.9])
+            assert np.isfinite(answer.reflectance).all()
+    half = propagation.propagate(rng.random((40, 64, 3)).astype(np.float32), fitted, scale=0.5)
+    assert half.header.grid == (20, 32)
 
 
-def test_resuming_without_a_state_is_refused(tiny: BTF, tmp_path: Path) -> None:
-    with pytest.raises(FitError, match="nothing to resume"):
-        fit.fit(tiny, model="neubtf", steps=1, out=tmp_path / "m.safetensors", resume=True)
-    (tmp_path / "m.safetensors.state").write_bytes(b"nonsense")
-    with pytest.raises(FormatError, match="not a readable state"):
-        fit.fit(tiny, model="neubtf", steps=1, out=tmp_path / "m.safetensors", resume=True)
+def test_a_tile_keeps_its_heights_in_texels(fitted: Path) -> None:
+    rng = np.random.default_rng(0)
+    coarse = torch.from_numpy(rng.random((1, 3, 20, 26)).astype(np.float32))
+    picture = augment.resized(coarse, (60, 78), wrap=False)[0].permute(1, 2, 0).numpy()
+    carried = propagation.propagate(picture, fitted)
+    tile, tiling = tile_neubtf(carried)
+    assert tile.header.grid == tiling.index.size != carried.header.grid
+    texels = [
+        m.weights["texture.heights"].astype(np.float32) * m.header.grid[1] for m in (carried, tile)
+    ]
+    # float16
+    np.testing.assert_allclose(tiling.index.of(texels[0]), texels[1], rtol=2e-3, atol=1e-4)
 
 
-# --- propagation ---------------------------------------------------------------------------------
-
-
-def _png(path: Path, pixels: np.ndarray) -> Path:
-    cv2.imwrite(str(path), pixels)
-    return path
-
-
-@pytest.mark.parametrize(
-    "pixels",
-    [
-        np.zeros((24, 40), np.uint8),
-        np.full((17, 23, 3), 255, np.uint8),
-        np.random.default_rng(0).integers(0, 65536, (16, 16, 3)).astype(np.uint16),
-        np.random.default_rng(0).integers(0, 256, (5, 64, 3)).astype(np.uint8),
-        np.ones((1, 1, 3), np.uint8),
-    ],
-    ids=["black grey", "white", "16 bit", "narrow", "one texel"],
-)
-def test_group_23_any_guidance_gives_a_material_of_its_size(
-    pixels: np.ndarray, fitted: Path, tmp_path: Path
+@pytest.mark.parametrize("size", [(32, 32), (31, 45), (1, 6)])
+def test_coarser_levels_are_means_of_the_finest_features(
+    size: tuple[int, int], fitted: Path
 ) -> None:
-    out = tmp_path / "p.safetensors"
-    propagation.propagate(_png(tmp_path / "g.png", pixels), fitted, out=out)
-    material = btfkit.load(out)
-    assert material.header.grid == pixels.shape[:2]
-    rgb, opacity = material.evaluate(
-        np.random.default_rng(0).random((50, 2)), [0.3, 0, 0.9], [0, 0.2, 0.9]
-    )
-    assert np.isfinite(rgb).all()
-    assert (opacity == 1).all()
+    picture = np.random.default_rng(0).random((*size, 3)).astype(np.float32)
+    weights = propagation.propagate(picture, fitted).weights
+    mean = weights["texture.0.0"].astype(np.float32).mean(axis=(0, 1))
+    last = max(size).bit_length() - 1
+    assert weights[f"texture.0.{last}"].shape == (1, 1, 8)
+    for level in range(1, last + 1):
+        # float16, of order one
+        found = weights[f"texture.0.{level}"].astype(np.float32).mean(axis=(0, 1))
+        np.testing.assert_allclose(found, mean, atol=3e-3)
 
 
-def test_a_propagated_model_needs_no_encoder_and_cannot_be_propagated_again(
+@pytest.mark.parametrize("level", [1, 2, 3])
+def test_a_blurred_query_is_answered_nearer_to_the_blurred_truth_than_a_sharp_one(
+    level: int, tiny: BTF, sharp: NeuBTF
+) -> None:
+    material, footprint = sharp, 0.5 * 2.0**level
+    blur = gaussian(32, footprint**2 - 0.25, wrap=True)
+    errors = np.zeros(2)
+    for pair in range(0, len(tiny), 8):
+        truth = np.einsum("ij,jkc,lk->ilc", blur, tiny.texture(pair), blur)
+        for k, asked in enumerate((footprint, 0.5)):
+            at = texel_centres(32, 32)
+            answer = material.evaluate(at, tiny.light[pair], tiny.view[pair], asked).reflectance
+            errors[k] += np.square(answer - truth).mean()
+    assert errors[0] < 0.7 * errors[1]
+
+
+# --- files of before -----------------------------------------------------------------------------
+
+
+def test_a_file_of_the_published_model_under_its_old_name_is_read_as_what_it_is(
+    tiny: BTF, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "old.neubtf.safetensors"
+    with monkeypatch.context() as patch:
+        patch.setattr(NeuBTFPaper, "model", "neubtf")
+        patch.setattr(published, "_LEAST_TAUGHT", 1)
+        settings = {"texels": "64", "pairs": "4"}
+        fit.fit(tiny, model="neubtf-paper", steps=20, out=path, settings=settings)
+    assert b'"model":"neubtf"' in path.read_bytes()
+    assert btfkit.load(path).model == file.header_of(path)["model"] == "neubtf-paper"
+    assert propagation.has_encoder(path)
+    picture = np.random.default_rng(0).random((16, 24, 3)).astype(np.float32)
+    assert propagation.propagate(picture, path).model == "neubtf-paper"
+
+
+def test_a_propagated_model_cannot_be_propagated_and_a_foreign_encoder_is_refused(
     fitted: Path, tmp_path: Path
 ) -> None:
-    guidance = np.random.default_rng(0).random((32, 32, 3)).astype(np.float32)
-    out = tmp_path / "p.safetensors"
-    propagation.propagate(guidance, fitted, out=out)
-    assert propagation.has_encoder(fitted)
-    assert not propagation.has_encoder(out)
+    picture = np.random.default_rng(0).random((16, 24, 3)).astype(np.float32)
+    propagation.propagate(picture, fitted, out=tmp_path / "p.safetensors")
+    assert btfkit.load(tmp_path / "p.safetensors").model == "neubtf"
+    assert not propagation.has_encoder(tmp_path / "p.safetensors")
     with pytest.raises(FitError, match="has no encoder"):
-        propagation.propagate(guidance, out)
-
-
-def test_the_verb_says_how_alike_a_rescaled_material_is(
-    fitted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from btfkit.cli import btfkit as group
-    from btfkit.cli.outcome import run
-
-    ramp = np.linspace(20, 235, 40).astype(np.uint8)
-    _png(tmp_path / "g.png", np.broadcast_to(ramp[:, None], (300, 40, 3)).copy())
-    line = ["propagate", tmp_path / "g.png", "--model", fitted, "-o", tmp_path / "p.safetensors"]
-    assert run(group, [*map(str, line), "--scale", "0.5", "--json"]) == 0
-    data = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert data["grid"] == [150, 20]
-    middle = images.read("g.png", (tmp_path / "g.png").read_bytes(), transfer="srgb")[22:278]
-    assert data["consistency_db"] == propagation.consistency(middle, fitted, scale=0.5)
-
-
-def test_scale_resizes_the_guidance_and_the_texel(fitted: Path) -> None:
-    guidance = np.random.default_rng(0).random((40, 64, 3)).astype(np.float32)
-    material = propagation.propagate(guidance, fitted, scale=0.5)
-    assert material.header.grid == (20, 32)
-    assert math.isfinite(propagation.consistency(guidance, fitted, scale=0.5))
-
-
-def test_propagation_moves_with_the_guidance(fitted: Path) -> None:
-    guidance = np.random.default_rng(0).random((32, 32, 3)).astype(np.float32)
-    moved = np.roll(guidance, (STRIDE, 2 * STRIDE), (0, 1))
-    textures = [
-        propagation.propagate(image, fitted, wrap="wrap").weights["texture"].astype(np.float32)
-        for image in (guidance, moved)
-    ]
-    # float16 textures of order one
-    np.testing.assert_allclose(
-        np.roll(textures[0], (STRIDE, 2 * STRIDE), (0, 1)), textures[1], atol=5e-3
-    )
-
-
-@pytest.mark.parametrize(
-    ("guidance", "options", "message"),
-    [
-        (np.zeros((8, 8, 5), np.float32), {}, "guidance has 5 channels; expected 1"),
-        (np.zeros((8, 8), np.float32), {}, r"guidance has shape \(8, 8\)"),
-        (np.zeros((0, 8, 3), np.float32), {}, r"guidance has shape \(0, 8, 3\)"),
-        (
-            np.zeros((8, 8, 3), np.float32),
-            {"scale": -1.0},
-            "scale = -1.0; expected a positive factor",
-        ),
-        (np.zeros((8, 8, 3), np.float32), {"scale": 999.0}, "guidance of 7992 x 7992; at most"),
-    ],
-)
-def test_guidance_that_no_image_is_is_refused(
-    guidance: np.ndarray, options: dict[str, Any], message: str, fitted: Path
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        propagation.propagate(guidance, fitted, **options)
-
-
-def test_alpha_and_texels_that_are_not_finite_are_left_out_with_a_warning(fitted: Path) -> None:
-    guidance = np.random.default_rng(0).random((16, 16, 4)).astype(np.float32)
-    with pytest.warns(UserWarning, match="the guidance has alpha"):
-        propagation.propagate(guidance, fitted)
-    guidance[3, 4] = np.nan
-    with pytest.warns(UserWarning, match="1 guidance texels are not finite"):
-        propagation.propagate(guidance[..., :3], fitted)
-
-
-def test_a_missing_or_broken_guidance_is_told(fitted: Path, tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no such image"):
-        propagation.propagate(tmp_path / "none.png", fitted)
-    (tmp_path / "g.png").write_bytes(b"no image")
-    with pytest.raises(FormatError):
-        propagation.propagate(tmp_path / "g.png", fitted)
-
-
-def test_group_19_latents_far_from_training_still_answer_finite(fitted: Path) -> None:
-    material: Any = btfkit.load(fitted)
-    weights = {**material.weights, "texture": material.weights["texture"] * np.float16(100)}
-    wild = type(material)(material.spec, weights, material.header)
-    uv = np.random.default_rng(0).random((1000, 2))
-    assert np.isfinite(wild.evaluate(uv, [0, 0, 1], [0.6, 0, 0.8]).reflectance).all()
-
-
-def test_real_lights_of_one_view_are_fitted(real_data: Path, tmp_path: Path) -> None:
-    btf = btfkit.open(real_data / "ubo2003_wallpaper").crop(slice(0, 64), slice(0, 64))
-    report = fit.fit(
-        btf,
-        model="neubtf",
-        steps=150,
-        settings=TINY | {"encoder": "false"},
-        out=tmp_path / "w.safetensors",
-    )
-    assert report.errors["pairs"] == 4
-    # the mean colour of all lights gives 13 dB
-    assert report.errors["psnr"] > 15
+        propagation.propagate(picture, tmp_path / "p.safetensors")
+    arrays = file.training_arrays(fitted)
+    del arrays["encoder.out.bias"]
+    file.save(btfkit.load(fitted), tmp_path / "bad.safetensors", training=arrays)
+    with pytest.raises(FormatError, match="the encoder does not fit this version"):
+        propagation.propagate(picture, tmp_path / "bad.safetensors")

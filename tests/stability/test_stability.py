@@ -27,7 +27,7 @@ from btfkit.fitting.neumip.start import initial_texels
 from btfkit.fitting.neumip.trainable import NeuMIP as Fitted
 from btfkit.footprint import gaussian
 from btfkit.materials.base import Header
-from btfkit.materials.neubtf import NeuBTFSpec
+from btfkit.materials.neubtf.paper import NeuBTFSpec
 from btfkit.materials.neumip.material import NeuMIP, in_precision
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.native import neural as native

@@ -24,7 +24,7 @@ from btfkit.io import images
 from btfkit.io.store import reader, writer
 from btfkit.materials import file
 from btfkit.materials.base import Header
-from btfkit.materials.neubtf import NeuBTF, NeuBTFSpec, renderer_shapes
+from btfkit.materials.neubtf.paper import NeuBTFPaper, NeuBTFSpec, renderer_shapes
 from btfkit.propagation import has_encoder
 from btfkit.synthesis import IndexMap, make_tileable, tile_btf, tile_image, tile_neubtf
 from btfkit.synthesis.drift import Drift
@@ -530,7 +530,7 @@ def test_one_slice_of_glints_does_not_decide_for_the_others() -> None:
 # --- models ----------------------------------------------------------------------------------
 
 
-def neubtf(h: int = 60, w: int = 75, **changes: Any) -> NeuBTF:
+def neubtf(h: int = 60, w: int = 75, **changes: Any) -> NeuBTFPaper:
     """A NeuBTF of random weights on a texture that does not tile."""
     rng = np.random.default_rng(0)
     spec = NeuBTFSpec((h, w), latents=4)
@@ -540,7 +540,7 @@ def neubtf(h: int = 60, w: int = 75, **changes: Any) -> NeuBTF:
     }
     weights["renderer.out.bias"] = np.full(3, 0.4, np.float32)
     weights["texture"] = (4 * grains(200, 200, seed=2, c=4)[:h, :w] - 2).astype(np.float16)
-    return NeuBTF(spec, weights, Header(grid=(h, w), wrap="clamp", texel_mm=0.1, **changes))
+    return NeuBTFPaper(spec, weights, Header(grid=(h, w), wrap="clamp", texel_mm=0.1, **changes))
 
 
 def test_latents_of_a_tiled_model_are_moved_and_never_mixed() -> None:
@@ -563,7 +563,7 @@ def test_latents_of_a_tiled_model_are_moved_and_never_mixed() -> None:
 
 def test_a_model_that_wraps_is_left_as_it_is() -> None:
     model = neubtf()
-    wraps = NeuBTF(model.spec, model.weights, replace(model.header, wrap="wrap"))
+    wraps = NeuBTFPaper(model.spec, model.weights, replace(model.header, wrap="wrap"))
     assert tile_neubtf(wraps)[0] is wraps
 
 

@@ -84,7 +84,7 @@ def fitted() -> Material:
     return fit(btf, model="neumip", steps=300, settings=settings, device="cpu").material
 
 
-@pytest.mark.parametrize("name", ["neumip", "neubtf"])
+@pytest.mark.parametrize("name", ["neumip", "neubtf-paper"])
 def test_pixels_are_what_the_program_says_to_their_queries(name: str, tmp_path: Path) -> None:
     material = made(name)
     near = quantised(material.program(), "half")

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, final
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from btfkit.fitting.neubtf import augment
-from btfkit.fitting.neubtf.settings import Settings
-from btfkit.fitting.neubtf.unet import STRIDE, Encoder
+from btfkit.fitting.neubtf.settings import Guidance
+from btfkit.fitting.neubtf.unet import STRIDE
 from btfkit.fitting.pool import Pool
 
 
@@ -33,11 +36,13 @@ class Guide:
         image: (1, 3, h, w) standardised.
         window: the part of the tile that it shows.
         size: (h, w) that the part was resampled to.
+        averaged: whether it is the mean frontal slice.
     """
 
     image: Tensor
     window: Window
     size: tuple[int, int]
+    averaged: bool
 
     @property
     def scaled(self) -> bool:
@@ -55,6 +60,7 @@ class Guides:
         wrap: whether the material tiles.
         settings: how often and how far the guidance varies.
         generator: of all randomness.
+        guiding: (n,) whether each pair of the BTF may guide; None lets all.
     """
 
     def __init__(
@@ -63,18 +69,20 @@ class Guides:
         pool: Pool,
         *,
         wrap: bool,
-        settings: Settings,
+        settings: Guidance,
         generator: torch.Generator,
+        guiding: NDArray[np.bool_] | None = None,
     ) -> None:
         self._frontal, self._pool, self._wrap = frontal, pool, wrap
-        self._settings, self._generator = settings, generator
+        self._settings, self._generator, self._guiding = settings, generator, guiding
         self._size = (int(frontal.shape[1]), int(frontal.shape[2]))
 
     def draw(self) -> Guide:
         """A guidance crop, rescaled and varied; only the input is, never what it has to give."""
-        image = self._frontal
-        if self._uniform() >= self._settings.frontal:
-            slot = self._integer(len(self._pool.pairs))
+        image, slots = self._frontal, self._slots()
+        averaged = self._uniform() < self._settings.frontal or not len(slots)
+        if not averaged:
+            slot = int(slots[self._integer(len(slots))])
             image = torch.from_numpy(self._pool.images[slot]).float().permute(2, 0, 1)
         window = self._window()
         scale = 1.0 if self._uniform() < 0.5 else self._settings.scales ** self._uniform()
@@ -83,7 +91,7 @@ class Guides:
         guide = augment.encoded(self.windowed(guide, window))
         guide = augment.resized(guide, size, wrap=False)
         guide = augment.Variation()(guide, self._generator)
-        return Guide(augment.standardised(guide), window, size)
+        return Guide(augment.standardised(guide), window, size, averaged)
 
     def windowed(self, image: Tensor, window: Window) -> Tensor:
         """The window of (b, c, h, w), around the border where it reaches over."""
@@ -94,6 +102,13 @@ class Guides:
         rows = torch.arange(window.top, window.top + window.height) % h
         cols = torch.arange(window.left, window.left + window.width) % w
         return image[:, :, rows][:, :, :, cols]
+
+    def _slots(self) -> NDArray[np.intp]:
+        """Slots of the pool whose textures may guide."""
+        pairs = self._pool.pairs
+        if self._guiding is None:
+            return np.arange(len(pairs))
+        return np.flatnonzero(self._guiding[pairs])
 
     def _window(self) -> Window:
         height, width = (self._side(side) for side in self._size)
@@ -118,7 +133,7 @@ class Guides:
         return float(torch.rand((), generator=self._generator))
 
 
-def encode(encoder: Encoder, guidance: Tensor, *, wrap: bool) -> Tensor:
+def encode(encoder: Callable[[Tensor], Tensor], guidance: Tensor, *, wrap: bool) -> Tensor:
     """A(G) at the size of the guidance, whatever that is.
 
     Sizes that the stride does not divide are resampled to the nearest that it does, and the

@@ -1,4 +1,4 @@
-"""The sinusoidal renderer of NeuBTF, trainable twin of `materials.neubtf`."""
+"""The sinusoidal renderer of NeuBTF, trainable twin of `materials.neubtf.paper`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, final
 import torch
 from torch import Tensor, nn
 
-from btfkit.materials.neubtf import HIDDEN, NeuBTFSpec
+from btfkit.materials.neubtf.paper import HIDDEN, NeuBTFSpec
 
 
 def on_disc(direction: Tensor) -> Tensor:
@@ -63,7 +63,7 @@ class Renderer(nn.Module):
         return self.out(x)
 
     def arrays(self) -> dict[str, Tensor]:
-        """The weights by the names of `materials.neubtf.renderer_shapes`."""
+        """The weights by the names of `materials.neubtf.paper.renderer_shapes`."""
         found = {}
         for index, (layer, norm) in enumerate(zip(self.layers, self.norms, strict=True)):
             for kind, module in (("", layer), (".norm", norm)):
@@ -96,7 +96,7 @@ class ParallaxHead(nn.Module):
         return last(torch.relu(first(inputs)))
 
     def arrays(self) -> dict[str, Tensor]:
-        """The weights by the names of `materials.neubtf.parallax_shapes`."""
+        """The weights by the names of `materials.neubtf.paper.parallax_shapes`."""
         found = {}
         for index, layer in enumerate(self.layers):
             for name, value in layer.named_parameters():

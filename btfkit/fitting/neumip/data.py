@@ -113,6 +113,11 @@ class TexelSource(Source):
         """(k,) the pair of each sharp texture in memory."""
         return self._pool.pairs
 
+    @property
+    def pool(self) -> Pool:
+        """The sharp textures in memory."""
+        return self._pool
+
     def shares(self, step: int, count: int) -> list[Share]:
         """What a batch is drawn from: the sharp textures last."""
         self._pool.at_step(step)

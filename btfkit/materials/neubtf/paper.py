@@ -1,4 +1,4 @@
-"""NeuBTF as it is used: a neural texture and a small sinusoidal renderer, in numpy.
+"""NeuBTF as published: a neural texture and a small sinusoidal renderer, in numpy.
 
 Source: Rodriguez-Pardo et al., "NeuBTF: Neural fields for BTF encoding and transfer",
 Computers & Graphics 114, 2023.
@@ -74,10 +74,10 @@ def parallax_shapes(spec: NeuBTFSpec) -> dict[str, tuple[int, ...]]:
 
 
 @final
-class NeuBTF(Material):
+class NeuBTFPaper(Material):
     """R(T(u, v), view, light): one texture lookup and 3011 weights for three channels."""
 
-    model: ClassVar[str] = "neubtf"
+    model: ClassVar[str] = "neubtf-paper"
     spec_type: ClassVar[type] = NeuBTFSpec
 
     def __init__(
