@@ -260,9 +260,9 @@ def fitted(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 def textures(material: Material) -> np.ndarray:
-    """(h, w, k) all that a material looks up."""
+    """All numbers that a material looks up, one after the other."""
     found = [a for name, a in sorted(material.weights.items()) if name.startswith("texture")]
-    return np.concatenate(found, axis=-1).astype(np.float32)
+    return np.concatenate([array.reshape(-1) for array in found]).astype(np.float32)
 
 
 def test_group_22_one_picture_guides_alike_in_8_and_16_bit_with_alpha_and_as_values(
