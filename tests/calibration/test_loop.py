@@ -78,7 +78,7 @@ def test_a_captured_run_becomes_a_material_on_a_new_image_by_three_commands(capt
     typed(captured, "ingest", "run", "--texel-mm", 1.125)
     store = btfkit.open(captured / "run.btf.zarr")
     assert store.shape == (12, 32, 32, 3)
-    report = typed(captured, "fit", "--model", "neubtf", "--steps", 400, "--set", "texels=128")
+    report = typed(captured, "fit", "--model", "neubtf", "--steps", 400)
     textures = np.stack([store.texture(pair) for pair in range(len(store))])
     # 400 steps end at 0.40 of what the mean colour leaves; few pairs, of which one is held out.
     assert report["mse"] < 0.6 * np.nanvar(textures, axis=(0, 1, 2)).mean()

@@ -51,7 +51,9 @@ def plugin(mi: Any, name: str, folder: Path, **options: Any) -> Any:
     return mi.load_dict({"type": "btfkit", "filename": str(path), **options})
 
 
-@pytest.mark.parametrize("name", ["lambert", "neumip", "neumip-clamped", "neumip-paper", "neubtf"])
+@pytest.mark.parametrize(
+    "name", ["lambert", "neumip", "neumip-clamped", "neumip-paper", "neubtf-paper"]
+)
 def test_a_traced_program_answers_as_the_material(name: str, mi: Any) -> None:
     from btfkit.render.mitsuba.evaluation import Evaluation
 
