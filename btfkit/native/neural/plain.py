@@ -115,6 +115,7 @@ def marched(
 def _network_depths(program: Program, found: DepthNetwork, uv: Array, view: Array) -> Array:
     psi = bilinear(found.texture.levels[0], uv, wrap=program.wrap)
     known = _known(view, view, None, None) | _columns(found.texture, psi)
+    known |= _on_discs(found.inputs, view, view)
     return _run(found.layers, found.inputs, known, rounded=program.rounded)[:, 0] * found.scale
 
 
@@ -268,6 +269,7 @@ def _last_layer(
         light, view = (bent.turned(direction, view, turn) for direction in (light, view))
         view[:, 2] = np.where(turn == 0, view[:, 2], np.maximum(view[:, 2], LOWEST_SEEN))
     known = _known(light, view, footprint if program.leveled else None, curvature)
+    known |= _on_discs(program.inputs, light, view)
     every = [*program.textures, *([program.scaling] if program.scaling else [])]
     values = []
     for texture in every:
@@ -295,7 +297,7 @@ def _heads(program: Program, raw: Array) -> dict[str, Array]:
 
 
 def _known(light: Array, view: Array, footprint: Array | None, curvature: Array | None) -> Known:
-    """Every number of `program.INPUTS` that a query holds, (b,) each."""
+    """The numbers of `conventions.INPUTS` that a query holds, but those on the disc, (b,) each."""
     total = light + view
     length = np.linalg.norm(total, axis=1, keepdims=True)
     none = length < 1e-6
@@ -308,8 +310,15 @@ def _known(light: Array, view: Array, footprint: Array | None, curvature: Array 
     found = dict(zip(("lx", "ly", "lz", "vx", "vy", "vz"), (*light.T, *view.T), strict=True))
     found |= dict(zip(("hx", "hy", "hz"), half.T, strict=True))
     found |= {"cos_diff": cos_diff, "level": level / LEVELS_UNIT, "curvature": curved}
-    found |= dict(zip(("lx_disc", "ly_disc"), on_disc(light).T, strict=True))
-    return found | dict(zip(("vx_disc", "vy_disc"), on_disc(view).T, strict=True))
+    return found
+
+
+def _on_discs(inputs: Sequence[str], light: Array, view: Array) -> Known:
+    """The numbers on the disc among a layer's inputs: two arctangents, which few models take."""
+    if not any(name.endswith("_disc") for name in inputs):
+        return {}
+    names = ("lx_disc", "ly_disc", "vx_disc", "vy_disc")
+    return dict(zip(names, (*on_disc(light).T, *on_disc(view).T), strict=True))
 
 
 def _columns(texture: Texture, values: Array) -> Known:
