@@ -151,8 +151,8 @@ def test_a_budget_is_what_one_waits_for(here: Path, capsys: pytest.CaptureFixtur
     phases = report["phases"]
     assert list(phases) == ["reading", "starting", "training", "writing", "evaluating"]
     after_reading = sum(phases.values()) - phases["reading"]
-    # One step, one look or one pair may end late: seconds on a busy machine.
-    assert after_reading < 9
+    # One step, one look or one pair may end late: seconds, and tens of them on a busy machine.
+    assert after_reading < 18
     assert phases["training"] > 1
     assert sum(phases.values()) < wall
     # 2 of 40 pairs of 16 x 16 fit into 2 s.
