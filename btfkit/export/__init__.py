@@ -7,4 +7,5 @@ TARGETS: dict[str, str] = {
     "npz": "btfkit.export.npz:write",
     "cpp": "btfkit.export.cpp:write",
     "glsl": "btfkit.export.glsl:write",
+    "exr": "btfkit.export.exr:write",
 }
