@@ -8,4 +8,5 @@ TARGETS: dict[str, str] = {
     "cpp": "btfkit.export.cpp:write",
     "glsl": "btfkit.export.glsl:write",
     "exr": "btfkit.export.exr:write",
+    "three": "btfkit.export.three:write",
 }
