@@ -9,4 +9,5 @@ TARGETS: dict[str, str] = {
     "glsl": "btfkit.export.glsl:write",
     "exr": "btfkit.export.exr:write",
     "three": "btfkit.export.three:write",
+    "onnx": "btfkit.export.onnx:write",
 }

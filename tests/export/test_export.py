@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import needs
 import numpy as np
 import pytest
 from cases import SPECS, directions, made
@@ -180,6 +181,8 @@ def test_a_reader_has_the_parts_that_its_material_needs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("target", list(TARGETS))
 def test_papers_and_a_picture_travel_along(target: str, tmp_path: Path) -> None:
+    if target == "onnx":
+        needs.module("onnx", install='"btfkit[onnx]"')
     result = export(made("lambert"), target, tmp_path / "out")
     about = json.loads((tmp_path / "out" / "about.json").read_text())
     assert about["licence"] == "CC0-1.0"
@@ -228,7 +231,9 @@ def test_a_quantised_program_is_off_by_half_a_step(texels: Any, step: float) -> 
 
 def test_what_no_export_knows_is_refused_by_name(tmp_path: Path) -> None:
     material = made("lambert")
-    with pytest.raises(ValueError, match="no target 'pdf'; there are npz, cpp, glsl, exr, three"):
+    with pytest.raises(
+        ValueError, match="no target 'pdf'; there are npz, cpp, glsl, exr, three, onnx"
+    ):
         export(material, "pdf", tmp_path / "out")
     btf = synth_btf("knit", size=8, lights="3", views="3", samples=1)
     with pytest.raises(TypeError, match="interpolation blends measured pairs"):
