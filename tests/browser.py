@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-import pytest
+from needs import lacking
 
 _FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader",
@@ -47,28 +47,30 @@ def chromium() -> str:
     named = os.environ.get("BTFKIT_CHROMIUM")
     found = named or next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
     if found is None:
-        say = "Chromium is missing: apt-get install chromium, or name one in BTFKIT_CHROMIUM"
-        pytest.fail(say) if os.environ.get("BTFKIT_REQUIRE_BROWSER") else pytest.skip(say)
-    return found
+        lacking("chromium", "apt-get install chromium, or name one in BTFKIT_CHROMIUM")
+    return found or ""
 
 
-def load(page: Path, *flags: str) -> Seen:
-    """The page once loaded."""
+def load(page: Path | str, *flags: str) -> Seen:
+    """The page, or what lies at an address, once loaded."""
     done = _run(page, "--dump-dom", *flags)
     return Seen(done.stdout, _console(done.stderr))
 
 
-def screenshot(page: Path, picture: Path, size: tuple[int, int] = (800, 600)) -> Seen:
+def screenshot(
+    page: Path | str, picture: Path, size: tuple[int, int] = (800, 600), *flags: str
+) -> Seen:
     """Write a picture of the page."""
-    done = _run(page, f"--screenshot={picture}", f"--window-size={size[0]},{size[1]}")
+    done = _run(page, f"--screenshot={picture}", f"--window-size={size[0]},{size[1]}", *flags)
     assert picture.is_file(), done.stderr
     return Seen(done.stdout, _console(done.stderr))
 
 
-def _run(page: Path, *flags: str) -> subprocess.CompletedProcess[str]:
+def _run(page: Path | str, *flags: str) -> subprocess.CompletedProcess[str]:
+    address = page if isinstance(page, str) else page.resolve().as_uri()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         return subprocess.run(
-            [chromium(), *_FLAGS, f"--user-data-dir={profile}", *flags, page.resolve().as_uri()],
+            [chromium(), *_FLAGS, f"--user-data-dir={profile}", *flags, address],
             capture_output=True, text=True, timeout=120, check=True,
         )  # fmt: skip
 

@@ -16,7 +16,7 @@ from btfkit.export import TARGETS
 @verb("export", example="btfkit export wool.neumip.safetensors --to cpp -o wool-cpp")
 @click.argument("model", type=click.Path(path_type=Path))
 @click.option("--to", "target", required=True, type=click.Choice(list(TARGETS)),
-              help="Arrays with a numpy reader, a C++17 header, GLSL ES 3.00.")  # fmt: skip
+              help="The program, or the form, that it is written for.")  # fmt: skip
 @click.option("-o", "--out", required=True, type=click.Path(path_type=Path), help="Folder to make.")
 @force_option
 def export_verb(bar: Bar, *, model: Path, target: str, out: Path, force: bool) -> Outcome:
@@ -40,4 +40,7 @@ def _next(target: str, out: Path) -> str:
         "npz": f"python {folder}/evaluate.py queries.npz answers.npz",
         "cpp": f"cd {folder} && c++ -O3 -std=c++17 example.cpp -o example && ./example",
         "glsl": f"open {folder}/example.html in a browser",
+        "exr": f"python {folder}/evaluate.py queries.npz answers.npz",
+        "onnx": f"python {folder}/evaluate.py queries.npz answers.npz",
+        "three": f"cd {folder} && npm install && python -m http.server, then open it in a browser",
     }[target]

@@ -7,4 +7,7 @@ TARGETS: dict[str, str] = {
     "npz": "btfkit.export.npz:write",
     "cpp": "btfkit.export.cpp:write",
     "glsl": "btfkit.export.glsl:write",
+    "exr": "btfkit.export.exr:write",
+    "three": "btfkit.export.three:write",
+    "onnx": "btfkit.export.onnx:write",
 }

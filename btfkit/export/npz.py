@@ -31,10 +31,14 @@ def write(material: Material, program: Program, folder: Path) -> None:
     (folder / "evaluate.py").write_text(reader(program, material.model))
 
 
-def reader(program: Program, model: str) -> str:
-    """The source of `evaluate.py`: the parts that the program needs."""
+def reader(program: Program, model: str, *, arrays: str = "npz") -> str:
+    """The source of `evaluate.py`: the parts that the program needs.
+
+    Args:
+        arrays: where it has its arrays from: "npz" or "exr".
+    """
     parts = sections("numpy.py.txt")
-    wanted = ["start", "lookup", "run"]
+    wanted = ["start", f"arrays_{arrays}", "activations", "lookup", "run"]
     if isinstance(program.depth, Heights):
         wanted.append("march")
     wanted.append("known")

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from btfkit.export.arrays import refuse_unknown
-from btfkit.export.glsl import drawable, encoded
-from btfkit.export.numbers import literal
+from btfkit.export.glsl import drawable, encoded, rgb
 from btfkit.export.package import about
 from btfkit.export.sections import filled, whole_text
 from btfkit.materials.base import Material
-from btfkit.render.studio import visible
 from btfkit.view.page import composed, in_script, section
 
 
@@ -28,7 +26,7 @@ def page(material: Material, *, title: str, small: bool = False) -> str:
     refuse_unknown(program)
     made = drawable(program, model=material.model, texels="byte" if small else "half")
     c = len(program.channels)
-    scene = filled(section("scene.glsl.txt", "scene"), channels=c, rgb=_rgb(program.channels))
+    scene = filled(section("scene.glsl.txt", "scene"), channels=c, rgb=rgb(program.channels))
     h, w = program.grid
     carried = {
         "aspect": program.aspect,
@@ -60,12 +58,3 @@ def _said(material: Material) -> list[tuple[str, str]]:
         ("borders", "tile" if known["wrap"] == "wrap" else "do not tile"),
         ("licence", known["licence"] or "not stated"),
     ]
-
-
-def _rgb(channels: tuple[str, ...]) -> str:
-    """A vec3 of the channels' linear RGB; of channels without colour their mean."""
-    rows = [
-        " + ".join(f"{literal(m)} * value[{k}]" for k, m in enumerate(column) if m)
-        for column in visible(channels).T
-    ]
-    return f"vec3({', '.join(row or '0.0' for row in rows)})"

@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import needs
 import numpy as np
 import pytest
 from cases import SPECS, directions, made
@@ -22,6 +23,7 @@ from btfkit.export.arrays import named, narrowed
 from btfkit.export.glsl.atlas import atlas, quantised
 from btfkit.export.package import export
 from btfkit.export.sections import filled
+from btfkit.io.images.exr import read_exr
 from btfkit.materials.base import Header, Material
 from btfkit.materials.file import save
 from btfkit.materials.lambert import Lambert, LambertSpec
@@ -75,10 +77,19 @@ def agree(rgb: np.ndarray, opacity: np.ndarray, response: Any) -> None:
     np.testing.assert_allclose(opacity, response.opacity, atol=1e-6)
 
 
-@every_case
-def test_arrays_and_their_reader_in_numpy_answer_as_the_material(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("target", "name"),
+    [
+        *(("npz", name) for name in SPECS),
+        ("exr", "neumip"),
+        *(pytest.param("exr", n, marks=pytest.mark.slow) for n in SPECS if n != "neumip"),
+    ],
+)
+def test_arrays_and_their_reader_in_numpy_answer_as_the_material(
+    target: str, name: str, tmp_path: Path
+) -> None:
     material, queries = made(name), asked()
-    export(material, "npz", tmp_path / "out")
+    export(material, target, tmp_path / "out")
     np.savez(tmp_path / "q.npz", **queries._asdict())
     command = [sys.executable, tmp_path / "out" / "evaluate.py", tmp_path / "q.npz"]
     subprocess.run([*command, tmp_path / "a.npz"], check=True)
@@ -107,6 +118,26 @@ def test_the_header_compiles_without_a_warning_and_answers_as_the_material(
     spoilt = subprocess.run(["./example"], cwd=out, check=False, capture_output=True, text=True)
     assert spoilt.returncode == 1
     assert "not the numbers that this header was written with" in spoilt.stderr
+
+
+def test_layers_and_mips_lie_where_samples_of_neural_appearance_look(tmp_path: Path) -> None:
+    material = made("neumip")
+    export(material, "exr", tmp_path / "out")
+    program = material.program()
+    said = json.loads((tmp_path / "out" / "model.json").read_text())
+    assert [(x["num_inputs"], x["num_outputs"]) for x in said["layers"]] == [
+        layer.weight.shape[::-1] for layer in program.layers
+    ]
+    for layer, described in zip(program.layers, said["layers"], strict=True):
+        weights = np.float32(described["weights"]).reshape(layer.weight.shape)
+        np.testing.assert_array_equal(weights, layer.weight)
+        np.testing.assert_array_equal(np.float32(described["biases"]), layer.bias)
+    for n, level in enumerate(program.textures[0].levels):
+        data = (tmp_path / "out" / f"latents.mip{n}.exr").read_bytes()
+        pixels, channels, _ = read_exr("mip", data)
+        assert channels == tuple(f"latents.{k:03d}" for k in range(level.shape[-1]))
+        np.testing.assert_array_equal(pixels, level)
+    assert not list((tmp_path / "out").glob("scaling*"))
 
 
 @pytest.mark.parametrize("value", [1e4, 6e4])
@@ -150,6 +181,8 @@ def test_a_reader_has_the_parts_that_its_material_needs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("target", list(TARGETS))
 def test_papers_and_a_picture_travel_along(target: str, tmp_path: Path) -> None:
+    if target == "onnx":
+        needs.module("onnx", install='"btfkit[onnx]"')
     result = export(made("lambert"), target, tmp_path / "out")
     about = json.loads((tmp_path / "out" / "about.json").read_text())
     assert about["licence"] == "CC0-1.0"
@@ -198,7 +231,9 @@ def test_a_quantised_program_is_off_by_half_a_step(texels: Any, step: float) -> 
 
 def test_what_no_export_knows_is_refused_by_name(tmp_path: Path) -> None:
     material = made("lambert")
-    with pytest.raises(ValueError, match="no target 'pdf'; there are npz, cpp, glsl"):
+    with pytest.raises(
+        ValueError, match="no target 'pdf'; there are npz, cpp, glsl, exr, three, onnx"
+    ):
         export(material, "pdf", tmp_path / "out")
     btf = synth_btf("knit", size=8, lights="3", views="3", samples=1)
     with pytest.raises(TypeError, match="interpolation blends measured pairs"):

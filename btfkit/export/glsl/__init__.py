@@ -10,9 +10,11 @@ from typing import Any, NamedTuple
 
 from btfkit.export.glsl.atlas import Texels, atlas
 from btfkit.export.glsl.code import shader
+from btfkit.export.numbers import literal
 from btfkit.export.sections import filled, sections, whole_text
 from btfkit.materials.base import Material
 from btfkit.program import Program
+from btfkit.render.studio import visible
 
 
 class Drawable(NamedTuple):
@@ -73,3 +75,12 @@ def write(material: Material, program: Program, folder: Path) -> None:
 def encoded(data: bytes) -> str:
     """Bytes as base64."""
     return base64.b64encode(data).decode()
+
+
+def rgb(channels: tuple[str, ...]) -> str:
+    """A vec3 of the channels' linear RGB in `value`; of channels without colour their mean."""
+    rows = [
+        " + ".join(f"{literal(m)} * value[{k}]" for k, m in enumerate(column) if m)
+        for column in visible(channels).T
+    ]
+    return f"vec3({', '.join(row or '0.0' for row in rows)})"

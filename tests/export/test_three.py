@@ -1,0 +1,179 @@
+"""A material in three.js: its textures in node, its pixels in Chromium."""
+
+from __future__ import annotations
+
+import base64
+import http.server
+import json
+import re
+import shutil
+import subprocess
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import browser
+import cv2
+import numpy as np
+import pytest
+from cases import made
+from needs import lacking
+
+from btfkit.export.glsl.atlas import atlas, quantised
+from btfkit.export.package import export
+from btfkit.export.three import THREE
+from btfkit.native.neural import plain
+
+pytestmark = pytest.mark.slow
+SIZE = 64
+LIGHT = (0.4, 0.5, 0.8)
+EYE = (0.6, -0.5, 2.2)
+# What a person would write into the page's console: a plane, drawn into a float target. Its
+# corners are those of the picture, so that no rasteriser rounds them.
+_LOOK = """<pre id="out"></pre><script type="module">
+while (!globalThis.view) await new Promise((done) => setTimeout(done, 20));
+const { THREE, renderer, material } = view;
+const camera = new THREE.PerspectiveCamera(), scene = new THREE.Scene(), [x, y, z] = %(eye)s;
+camera.position.set(x, y, z);
+const edges = [-1 - x, 1 - x, 1 - y, -1 - y].map((edge) => edge * 0.1 / z);
+camera.projectionMatrix.makePerspective(...edges, 0.1, 10);
+camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+const geometry = new THREE.PlaneGeometry(2, 2);
+geometry.computeTangents();
+const mesh = new THREE.Mesh(geometry, material);
+scene.add(mesh);
+material.uniforms.btfkit_light.value.set(%(light)s);
+material.uniforms.btfkit_repeat.value.set(3, 2);
+const target = new THREE.WebGLRenderTarget(%(size)d, %(size)d, { type: THREE.FloatType });
+const found = [];
+for (const footprint of [0.5, -1]) {
+  material.uniforms.btfkit_footprint.value = footprint;
+  renderer.setRenderTarget(target);
+  renderer.setClearColor(0, 0);
+  renderer.clear();
+  renderer.render(scene, camera);
+  const pixels = new Float32Array(4 * %(size)d ** 2);
+  renderer.readRenderTargetPixels(target, 0, 0, %(size)d, %(size)d, pixels);
+  let text = "";
+  for (const byte of new Uint8Array(pixels.buffer)) text += String.fromCharCode(byte);
+  found.push(btoa(text));
+}
+document.getElementById("out").textContent = found.join();
+</script>"""
+
+
+@pytest.fixture(scope="module")
+def modules() -> Path:
+    """The folder node_modules with three.js in it, fetched once by npm."""
+    kept = Path(tempfile.gettempdir()) / f"btfkit-three-{THREE}"
+    if not (kept / "node_modules" / "three" / "build").is_dir():
+        npm = shutil.which("npm")
+        if npm is None:
+            lacking("three", "apt-get install npm")
+        with tempfile.TemporaryDirectory(dir=kept.parent) as place:
+            call = [npm or "", "install", "--silent", "--no-audit", "--no-fund", "--prefix", place]
+            done = subprocess.run([*call, f"three@{THREE}"], check=False, timeout=300)
+            if done.returncode:
+                lacking("three", f"npm install three@{THREE}")
+            if not kept.exists():
+                Path(place).rename(kept)
+                Path(place).mkdir()
+    return kept / "node_modules"
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """The address of a folder that is served to this machine alone."""
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    handler = partial(Quiet, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+def exported(name: str, modules: Path, folder: Path) -> Path:
+    export(made(name), "three", folder)
+    (folder / "node_modules").symlink_to(modules)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["neumip", "rainer20"])
+def test_node_reads_the_pair_with_the_package_three(
+    name: str, modules: Path, tmp_path: Path
+) -> None:
+    node = shutil.which("node")
+    if node is None:
+        lacking("three", "apt-get install nodejs npm")
+    out = exported(name, modules, tmp_path / "out")
+    done = subprocess.run([node or "", "check.mjs"], cwd=out, check=True, capture_output=True)
+    said = json.loads(done.stdout)
+    assert said["three"] == THREE.split(".")[1]
+    program = made(name).program()
+    textures = atlas(program, "half")
+    layers, h, w = textures.size
+    assert said["textures"]["btfkit_texels"]["size"] == [w, h, layers]
+    # Sums of thousands of halves, of which each is exact.
+    total = float(textures.data.astype(np.float64).sum())
+    assert abs(said["textures"]["btfkit_texels"]["sum"] - total) < 1e-6
+    assert ("btfkit_heights" in said["textures"]) == (textures.heights is not None)
+
+
+def rays() -> tuple[np.ndarray, np.ndarray]:
+    """Where each pixel, bottom row first, sees the plane z = 0, and from which direction."""
+    step = (np.arange(SIZE) + 0.5) / SIZE * 2 - 1
+    place = np.stack(np.meshgrid(step, step), axis=-1)
+    way = np.concatenate([EYE[:2] - place, np.full((SIZE, SIZE, 1), EYE[2])], axis=-1)
+    return place, way / np.linalg.norm(way, axis=-1, keepdims=True)
+
+
+@pytest.mark.browser
+def test_the_page_shows_a_ball_and_says_nothing_in_the_console(
+    modules: Path, tmp_path: Path
+) -> None:
+    picture = tmp_path / "seen.png"
+    with served(exported("neumip", modules, tmp_path / "out")) as address:
+        seen = browser.screenshot(f"{address}/", picture, (400, 400), "--virtual-time-budget=8000")
+    assert seen.errors == []
+    drawn = cv2.imread(str(picture))
+    assert drawn[100:300, 100:300].std() > 5
+    # Its background, as sRGB.
+    assert abs(int(drawn[380, 20, 0]) - 0x33) <= 1
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("name", ["neumip", "neumip-paper"])
+def test_the_page_draws_what_the_material_answers(name: str, modules: Path, tmp_path: Path) -> None:
+    out = exported(name, modules, tmp_path / "out")
+    page = out / "index.html"
+    assert len(page.read_text().splitlines()) <= 55
+    assert not re.search(r"https?://", page.read_text() + (out / "btfkit.js").read_text())
+    values = {"eye": list(EYE), "light": ", ".join(map(str, LIGHT)), "size": SIZE}
+    (out / "look.html").write_text(page.read_text() + _LOOK % values)
+    with served(out) as address:
+        seen = browser.load(f"{address}/look.html", "--virtual-time-budget=8000")
+    assert seen.errors == []
+    place, view = rays()
+    uv = np.stack([place[..., 0] + 1, 1 - place[..., 1]], axis=-1) / 2 * [3, 2]
+    light = np.broadcast_to(np.array(LIGHT) / np.linalg.norm(LIGHT), view.shape)
+    program = quantised(made(name).program(), "half")
+    asked = [np.float32(part).reshape(SIZE**2, -1) for part in (uv - np.floor(uv), light, view)]
+    step = np.array([3, 2]) / SIZE * program.grid[::-1]
+    for text, footprint in zip(
+        seen.text("out").split(","), (0.5, 0.5 * np.sqrt((step**2).sum() / 2)), strict=True
+    ):
+        found = np.frombuffer(base64.b64decode(text), "<f4").reshape(SIZE**2, 4)
+        blur = np.full(SIZE**2, footprint, np.float32)
+        wanted, opacity = plain.answer(program, *asked, blur)
+        error = np.abs(found[:, :3] - wanted) / np.maximum(1, np.abs(wanted))
+        assert wanted.std() > 0.01
+        assert np.mean(error <= 2e-4) >= 0.999
+        np.testing.assert_allclose(found[:, 3], opacity, atol=1e-6)
