@@ -11,6 +11,8 @@ from typing import Any
 LEAK = 0.01
 # A depth moves a lookup along a direction by no more than if its cosine were this.
 LOWEST_COSINE = 0.6
+# Cosine between view and the normal of a sampling lobe below which the lobe draws nothing.
+LEAST_FACING = 0.02
 # Looks at most along a view ray through heights.
 LOOKS = 8
 # Looks at most along a view ray that curvature lets leave the heights again.

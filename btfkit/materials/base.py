@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, final
+from typing import TYPE_CHECKING, Any, ClassVar, Self, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from btfkit import queries
 from btfkit.btf import BTF, QUANTITY, RGB, Wrap
+from btfkit.native.neural import plain
 from btfkit.native.prepare import Prepared, prepare, prepare_lights
 from btfkit.program import Program
 from btfkit.queries import Query, Response
+
+if TYPE_CHECKING:
+    from btfkit.materials.lobes import LobeTable
 
 Array = NDArray[np.float32]
 # Queries are answered in blocks, so that a picture of any size needs bounded memory.
@@ -106,6 +111,7 @@ class Material(ABC):
         self.weights = dict(weights)
         self.header = header
         self._warned: set[str] = set()
+        self._lobes: LobeTable | None = None
 
     def __repr__(self) -> str:
         """Short: the model, its grid and its size."""
@@ -156,6 +162,68 @@ class Material(ABC):
             f"{self.model} blends measured pairs and has no program; "
             f"models that have one: {', '.join(PROGRAMS)}"
         )
+
+    def ray_depths(self, uv: Array, view: Array) -> Array | None:
+        """Depth (b,) at which view rays end, tile widths, on the plane; None where none has any.
+
+        Args:
+            uv: (b, 2) in the tile. view: (b, 3) unit vectors above the horizon.
+        """
+        try:
+            program = self.program()
+        except TypeError:
+            return None
+        return None if program.depth is None else plain.depths(program, uv, view)
+
+    @property
+    def lobes(self) -> LobeTable:
+        """What lights are drawn from: read with the material, or fitted to it when first asked."""
+        if self._lobes is None:
+            from btfkit.materials.lobes.sampling import derived
+
+            self._lobes = derived(self)
+        return self._lobes
+
+    def with_lobes(self, lobes: LobeTable) -> Self:
+        """The same material with lobes that were fitted before."""
+        other = copy.copy(self)
+        other._lobes = lobes
+        return other
+
+    @final
+    def sample(
+        self, uv: ArrayLike, view: ArrayLike, random: Any, footprint: ArrayLike = 0.5
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lights drawn roughly as the material reflects them; shapes broadcast.
+
+        Args:
+            uv, view, footprint: as `evaluate` takes them.
+            random: (..., 2) or (..., 3) numbers from 0 to 1, or a numpy Generator that draws
+                them. Of three the first chooses a lobe.
+
+        Returns:
+            light: (..., 3) unit vectors above the horizon.
+            pdf: (...) their density over solid angle, more than 0, and never less than a tenth of
+                cos / pi; 0, and a light straight up, for queries that `evaluate` masks.
+
+        Raises:
+            ValueError: wrong last axes, shapes that do not broadcast, numbers beyond 0 and 1.
+        """
+        from btfkit.materials.lobes import sampling
+
+        return sampling.sample(self, uv, view, random, footprint)
+
+    @final
+    def pdf(
+        self, uv: ArrayLike, light: ArrayLike, view: ArrayLike, footprint: ArrayLike = 0.5
+    ) -> NDArray[np.float64]:
+        """Density (...) over solid angle with which `sample` draws lights (..., 3).
+
+        It integrates to 1 over the hemisphere and is 0 below the horizon.
+        """
+        from btfkit.materials.lobes import sampling
+
+        return sampling.pdf(self, uv, light, view, footprint)
 
     @final
     def evaluate(

@@ -18,10 +18,13 @@ from btfkit.errors import FormatError
 from btfkit.files import whole
 from btfkit.materials import MODELS, material_class, present_name
 from btfkit.materials.base import Header, Material
+from btfkit.materials.lobes import LobeTable
 
 VERSION = 1
 # Arrays that only the fitting side reads (a NeuBTF's encoder) carry this prefix.
 TRAINING = "training."
+# The finest level of the sampling lobes, (h, w, 5) float16, where they were stored.
+LOBES = "lobes.table"
 
 
 def save(
@@ -29,6 +32,7 @@ def save(
     path: str | os.PathLike[str],
     *,
     training: Mapping[str, NDArray[Any]] | None = None,
+    lobes: bool = False,
     force: bool = False,
 ) -> None:
     """Write a material; the file appears whole under its name or not at all.
@@ -37,6 +41,7 @@ def save(
         material: what to write.
         path: file to write, `*.safetensors`.
         training: further arrays that only fitting and propagation read, by name.
+        lobes: whether sampling lobes are stored, too, so that readers need not fit them.
         force: whether an existing file is replaced.
 
     Raises:
@@ -52,6 +57,8 @@ def save(
     arrays = {name: np.ascontiguousarray(value) for name, value in material.weights.items()}
     for name, value in (training or {}).items():
         arrays[TRAINING + name] = np.ascontiguousarray(value)
+    if lobes:
+        arrays[LOBES] = material.lobes.levels[0].astype(np.float16)
     with whole(path, force=force) as partial:
         partial.write_bytes(_packed(arrays, metadata))
 
@@ -98,7 +105,12 @@ def load(path: str | os.PathLike[str]) -> Material:
         kind = material_class(model)
         spec = kind.spec_type(**_tuples(described))
         fields = {name: json.loads(metadata[name]) for name in Header.__dataclass_fields__}
-        return kind(spec, arrays, Header(**_tuples(fields)))
+        table = arrays.pop(LOBES, None)
+        material: Material = kind(spec, arrays, Header(**_tuples(fields)))
+        if table is None:
+            return material
+        header = material.header
+        return material.with_lobes(LobeTable.of(table, grid=header.grid, wrap=header.wrap))
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(path, f"the header does not describe a material: {error}") from error
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, final
 
+import numpy as np
+
 from btfkit.materials.base import Array, Header, Material
+from btfkit.materials.lobes import LobeTable
+from btfkit.materials.lobes.sampling import derived
+from btfkit.native.neural import plain
 from btfkit.queries import Query
 from btfkit.relief.relief import Relief
 from btfkit.relief.trace import SAMPLES, geometry, trace
@@ -55,6 +60,20 @@ class TracedRelief(Material):
     @classmethod
     def shapes(cls, spec: TracedSpec, header: Header) -> dict[str, tuple[int, ...]]:
         return {}
+
+    def ray_depths(self, uv: Array, view: Array) -> Array:
+        height, wrap = self._relief.height, self._relief.wrap == "wrap"
+        along = plain.ray(view, self._relief.aspect, 1.0)
+        met = plain.crossing(height, uv, along, wrap=wrap) * plain.lift(view)
+        return np.asarray(met, np.float32)
+
+    @property
+    def lobes(self) -> LobeTable:
+        """As of every material, but fitted to answers of one ray each: the mean is the same."""
+        if self._lobes is None:
+            one = TracedRelief(self._relief, replace(self.spec, samples=1))
+            self._lobes = derived(one)
+        return self._lobes
 
     def _answer(self, query: Query) -> tuple[Array, Array | None]:
         spec = self.spec

@@ -409,3 +409,21 @@ def test_the_program_of_a_neubtf_with_parallax_moves_its_lookup_as_the_model_doe
     wanted = material.evaluate(uv, light, view).reflectance
     # As above; a place on the border between two texels moves with rounding.
     np.testing.assert_allclose(rgb, wanted, rtol=2e-3, atol=2e-4)
+
+
+@every_model
+def test_lights_are_drawn_as_densely_as_said_and_answer_for_the_hemisphere(model: str) -> None:
+    material, rng = fitted(model), np.random.default_rng(8)
+    uv, view = rng.random((40, 2)), upper(rng, 40)
+    light, pdf = material.sample(uv[:, None], view[:, None], rng.random((40, 256, 3)))
+    assert light.shape == (40, 256, 3)
+    np.testing.assert_allclose(material.pdf(uv[:, None], light, view[:, None]), pdf, rtol=1e-6)
+    assert (pdf >= 0.0999 * light[..., 2] / np.pi).all()
+    value = material.evaluate(uv[:, None], light, view[:, None]).reflectance[..., 0] / np.pi / pdf
+    first, turn = rng.random((2, 40, 256))
+    radius, angle = np.sqrt(first), 2 * np.pi * turn
+    even = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - first)], axis=2)
+    cosine = material.evaluate(uv[:, None], even, view[:, None]).reflectance[..., 0] / even[..., 2]
+    spread = np.sqrt((value.var(axis=1) + cosine.var(axis=1)).mean() / value.size)
+    # Both estimate one integral: five deviations of their difference, and rounding.
+    assert abs(value.mean() - cosine.mean()) <= 5 * spread + 1e-3 * cosine.mean()
