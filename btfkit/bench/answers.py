@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from btfkit.bench.cases import Case
+from btfkit.bench.measures import by_picture
 from btfkit.errors import BtfkitError
 from btfkit.io import queryfile
-from btfkit.materials.evaluation import errors_of_pictures, errors_on_answers, texel_centres
+from btfkit.materials.evaluation import errors_on_answers, texel_centres
 from btfkit.queries import QuerySet
 
 # Directions that went through another program come back rounded.
@@ -52,7 +53,7 @@ def scored(name: str, answers: QuerySet, case: Case) -> dict[str, Any]:
     if case.pictures is None:
         errors: Mapping[str, Any] = errors_on_answers(answers.rgb, answers.opacity, case.queries)
     else:
-        errors = errors_of_pictures(answers.rgb.reshape(case.pictures.shape), case.pictures)
+        errors = by_picture(list(answers.rgb.reshape(case.pictures.shape)), case)
     return {
         "material": case.name, "model": name, "settings": {}, "label": name,
         "budget_cpu_s": None, "elsewhere": True, **errors,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit import io, sources
+from btfkit.bench import strata
 from btfkit.btf import BTF
 from btfkit.footprint import blur_of, blurred, gaussian, most_levels, of_level
 from btfkit.heldout import split
@@ -55,6 +56,8 @@ class Case:
         queries: held out: rows of a query file, or texels of the pictures at every level of detail.
         pictures: held-out pairs, whole, in memory; None where the data are queries.
         coarse: the pictures at every level but the sharp one.
+        angle: (p,) of each picture, degrees to the nearest pair trained on, where pairs are held
+            out by that.
     """
 
     name: str
@@ -62,6 +65,7 @@ class Case:
     queries: QuerySet
     pictures: BTF | None = None
     coarse: tuple[Coarse, ...] = ()
+    angle: NDArray[np.float64] | None = None
 
     @property
     def samples(self) -> int:
@@ -111,6 +115,16 @@ def stored(path: Path, *, holdout: float, seed: int) -> Case:
     train, test = split(len(btf), holdout, seed)
     shown = np.random.default_rng(seed).permutation(test)[:_PICTURES]
     return _case(name_of(path), btf.subset(train), btf.subset(shown))
+
+
+def stratified(path: Path, *, holdout: float, seed: int) -> Case:
+    """A measured BTF with pairs held out at every distance from those trained on."""
+    btf = io.open(path)
+    train, test = strata.split(btf.light, btf.view, holdout=holdout, seed=seed)
+    angle = strata.angles(btf.light[test], btf.view[test], btf.light[train], btf.view[train])
+    shown = strata.shown(angle, each=_PICTURES, seed=seed)
+    case = _case(name_of(path), btf.subset(train), btf.subset(test[shown]))
+    return replace(case, angle=angle[shown])
 
 
 def asked(path: Path, *, holdout: float, seed: int) -> Case:

@@ -6,7 +6,7 @@ import ctypes
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit import metrics
+from btfkit import directions, gains, metrics
 from btfkit.bench.cases import Case, Coarse
 from btfkit.bench.machine import peak
 from btfkit.materials.base import Material
-from btfkit.materials.evaluation import errors_on_btf, errors_on_queries
+from btfkit.materials.evaluation import (
+    answer_pair,
+    errors_of_pictures,
+    errors_on_btf,
+    errors_on_queries,
+)
 from btfkit.native import neural as kernels
 from btfkit.queries import QuerySet
 
@@ -32,7 +37,11 @@ def errors(material: Material, case: Case) -> dict[str, Any]:
     with _no_warning_of_missing_parts():
         if case.pictures is None:
             return errors_on_queries(material, case.queries)
-        found = errors_on_btf(material, case.pictures)
+        if case.angle is None:
+            found = errors_on_btf(material, case.pictures)
+        else:
+            pairs = range(len(case.pictures))
+            found = by_picture([answer_pair(material, case.pictures, p) for p in pairs], case)
         if material.has_levels:
             levels = errors_on_queries(material, case.queries).get("levels", [])
             pictured = {0: {key: found[key] for key in _PICTURED if key in found}}
@@ -41,6 +50,36 @@ def errors(material: Material, case: Case) -> dict[str, Any]:
         return found
 
 
+def by_picture(answers: Sequence[NDArray[np.float32]], case: Case) -> dict[str, Any]:
+    """Errors over all pictures of a case, and `each` of them where pairs are held out by angle:
+    where it was seen from, and how far off it is, as answered and with gains (`gains.crossed`).
+    """
+    btf = case.pictures
+    if btf is None:
+        raise ValueError(f"{case.name} has queries, and no pictures to compare with")
+    found = errors_of_pictures(answers, btf)
+    if case.angle is None:
+        return found
+    each = []
+    tilts = [directions.to_angles(d)[0] for d in (btf.light, btf.view)]
+    for pair, answer in enumerate(answers):
+        truth = btf.texture(pair)
+        if not np.isfinite(truth).any():
+            continue
+        one: dict[str, Any] = {"angle_deg": float(case.angle[pair])}
+        for name, tilt in zip(("light_deg", "view_deg"), tilts, strict=True):
+            one[name] = float(np.degrees(tilt[pair]))
+        for suffix, given in (("", answer), ("_gains", gains.crossed(answer, truth))):
+            pooled, pictured = metrics.Pooled(), metrics.Pictured()
+            pooled.add(given, truth)
+            pictured.add(given, truth)
+            errors = {**pooled.errors(), **pictured.errors()}
+            one |= {f"{key}{suffix}": errors[key] for key in _EACH if key in errors}
+        each.append(one)
+    return {**found, "each": each}
+
+
+_EACH = ("mse", "mse_log1p", "ssim_srgb", "flip")
 # By level the pooled errors are of texels at random, these of whole pictures.
 _PICTURED = ("psnr_srgb", "ssim_srgb", "flip")
 

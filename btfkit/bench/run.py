@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, final
 
-from btfkit.bench import answers, kernels, plots, tables
+from btfkit.bench import answers, kernels, plots, real, tables
 from btfkit.bench.cases import (
     Case,
     asked,
@@ -17,6 +17,7 @@ from btfkit.bench.cases import (
     procedural,
     rows_of,
     stored,
+    stratified,
 )
 from btfkit.bench.cells import Cell, cells_of, refusal, run_cell, run_together, shared_cells
 from btfkit.bench.machine import machine
@@ -42,6 +43,8 @@ class Profile:
         holdout: share of the pairs of stores, and of the rows of query files, that are held out.
         answers: (name, query file) of methods from elsewhere, answered questions.
         seed: of data and models. kernel_seconds: a figure of the kernel tables; 0 for none.
+        measured: whether pairs of stores are held out by their angle to the nearest pair trained
+            on, and the scoreboard of `btfkit.bench.real` is written.
     """
 
     materials: tuple[str, ...] = ("cobbles", "woven", "scratched", "print")
@@ -54,6 +57,7 @@ class Profile:
     holdout: float = 0.05
     seed: int = 0
     kernel_seconds: float = 0.5
+    measured: bool = False
 
     @property
     def sources(self) -> tuple[str | Path, ...]:
@@ -65,6 +69,11 @@ QUICK = Profile(
     materials=("cobbles", "print"), budgets_cpu_s=(0.5, 1.5), size=48, directions=12,
     kernel_seconds=0.1,
 )  # fmt: skip
+
+# What a scoreboard of measured materials changes of a profile.
+REAL: dict[str, Any] = {
+    "measured": True, "holdout": 0.1, "budgets_cpu_s": (20.0,), "kernel_seconds": 0.0,
+}  # fmt: skip
 
 
 def run(profile: Profile, folder: Path, *, progress: Progress | None = None) -> dict[str, Any]:
@@ -102,6 +111,8 @@ def run(profile: Profile, folder: Path, *, progress: Progress | None = None) -> 
         rows = now
         results = {**further, "cells": rows}
         _report(folder, results)
+        if profile.measured:
+            real.write(folder, results)
     return results
 
 
@@ -187,10 +198,10 @@ def _run_missing(profile: Profile, folder: Path, progress: Progress | None) -> N
         for source in profile.sources
     ]  # fmt: skip
     together = shared_cells(
-        [name_of(source) for source in pictured], profile.models, profile.budgets_cpu_s,
-        seed=profile.seed,
+        [name_of(source) for source in pictured if not profile.measured], profile.models,
+        profile.budgets_cpu_s, seed=profile.seed,
     )  # fmt: skip
-    missing = not all(_file(folder, cell).is_file() for cell in together)
+    missing = bool(together) and not all(_file(folder, cell).is_file() for cell in together)
     total = sum(map(len, planned)) + len(together)
     done = 0
     cases: list[Case] = []
@@ -235,6 +246,8 @@ def _claim(folder: Path, profile: Profile) -> None:
     """Cells of different data must not meet in one folder."""
     mark = folder / "profile.json"
     decisive = {name: getattr(profile, name) for name in ("size", "directions", "holdout", "seed")}
+    if profile.measured:
+        decisive["measured"] = True
     if mark.is_file() and json.loads(mark.read_text()) != decisive:
         raise BtfkitError(
             f"{folder} holds results of {json.loads(mark.read_text())}, not of {decisive}",
@@ -248,7 +261,7 @@ def _case(source: str | Path, profile: Profile) -> Case:
         return procedural(
             source, size=profile.size, directions=profile.directions, seed=profile.seed
         )
-    read = asked if has_queries(source) else stored
+    read = asked if has_queries(source) else stratified if profile.measured else stored
     return read(source, holdout=profile.holdout, seed=profile.seed)
 
 

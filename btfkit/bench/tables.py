@@ -91,7 +91,7 @@ def cells(rows: Sequence[Row]) -> str:
             continue
         lines.append([row["label"], *(_in(form, row.get(key), times) for _, key, form, times
                                       in _COLUMNS)])  # fmt: skip
-    return _table(names, lines)
+    return table(names, lines)
 
 
 def brief(rows: Sequence[Row]) -> str:
@@ -102,7 +102,7 @@ def brief(rows: Sequence[Row]) -> str:
                                           in columns)]
         for row in rows
     ]  # fmt: skip
-    return _table(("material", "model", *(title for title, *_ in columns)), lines)
+    return table(("material", "model", *(title for title, *_ in columns)), lines)
 
 
 def csv_of(rows: Sequence[Row]) -> str:
@@ -166,7 +166,7 @@ def levels(rows: Sequence[Row], title: str, say: Any) -> str:
     for label, row in chosen.items():
         by_level = {level["level"]: say(level) for level in row["levels"]}
         lines.append([label, *(by_level.get(level, "") for level in every)])
-    return _table([title, *map(str, every)], lines)
+    return table([title, *map(str, every)], lines)
 
 
 def generic(rows: Sequence[Row]) -> str:
@@ -174,10 +174,11 @@ def generic(rows: Sequence[Row]) -> str:
     if not rows:
         return "nothing to compare\n"
     names = list(rows[0])
-    return _table(names, [[_short(row[name]) for name in names] for row in rows])
+    return table(names, [[_short(row[name]) for name in names] for row in rows])
 
 
-def _table(names: Sequence[Any], lines: Iterable[Sequence[Any]]) -> str:
+def table(names: Sequence[Any], lines: Iterable[Sequence[Any]]) -> str:
+    """A table as Markdown has it."""
     rows = [list(map(str, names)), ["---"] * len(names), *(list(map(str, line)) for line in lines)]
     return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
 

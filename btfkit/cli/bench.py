@@ -31,6 +31,14 @@ btfkit bench wool.btf.zarr --questions && btfkit bench wool.btf.zarr --answers o
     "--answers", "answers", type=SettingType(), multiple=True, metavar="NAME=FILE.npz",
     help="Score a method from elsewhere: answered questions, rgb added; repeatable.",
 )  # fmt: skip
+@click.option(
+    "--real", type=click.Path(path_type=Path), metavar="DIR",
+    help="Every store or source of a folder; pairs held out by their angle to the nearest other.",
+)  # fmt: skip
+@click.option(
+    "--holdout", type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    help="Share of pairs, or rows, held out; by default 0.05, with --real 0.1.",
+)  # fmt: skip
 @click.option("--questions", is_flag=True, help="Write what such a method is asked; fit nothing.")
 @seed_option
 def bench_verb(
@@ -44,6 +52,8 @@ def bench_verb(
     directions: int | None,
     quick: bool,
     answers: tuple[tuple[str, str], ...],
+    real: Path | None,
+    holdout: float | None,
     questions: bool,
     seed: int,
 ) -> Outcome:
@@ -54,15 +64,27 @@ def bench_verb(
     the folder holds: what former calls finished is kept and told with the rest, so that models,
     budgets and materials may be run one after the other, or by several processes at a time.
 
+    --real DIR: every measured material of a folder. Held-out pairs are alone or in holes, errors
+    are told by the angle to the nearest pair trained on and with gains; real.md, with two figures.
+
     Your own method: --questions writes FOLDER/questions/NAME.npz (uv, light, view); add rgb to each
     and name them with --answers. Without --model nothing is fitted then.
     """
-    from btfkit.bench.run import QUICK, Profile, ask, run
+    from btfkit.bench.real import PAGE, PICTURES, sources_in
+    from btfkit.bench.run import QUICK, REAL, Profile, ask, run
     from btfkit.bench.tables import brief
     from btfkit.errors import meaning
     from btfkit.relief.procedural import CATALOGUE
 
     profile = QUICK if quick else Profile()
+    declined: dict[str, str] = {}
+    if real is not None:
+        if names:
+            raise click.UsageError("NAMES and --real DIR are given; expected one of them")
+        found_there, declined = sources_in(real)
+        profile = replace(profile, stores=tuple(found_there), materials=(), **REAL)
+        if quick:
+            profile = replace(profile, budgets_cpu_s=QUICK.budgets_cpu_s)
     if names:
         stores = tuple(Path(name) for name in names if name not in CATALOGUE)
         for path in stores:
@@ -84,6 +106,7 @@ def bench_verb(
         models=models or profile.models,
         budgets_cpu_s=tuple(sorted(budgets)) or profile.budgets_cpu_s,
         size=size or profile.size,
+        holdout=holdout or profile.holdout,
         directions=directions or profile.directions,
         seed=seed,
     )
@@ -92,10 +115,14 @@ def bench_verb(
         asked = ask(profile, folder)
         return Outcome("\n".join(map(str, asked)), {"questions": asked})
     found = run(profile, folder, progress=bar)
-    files = [folder / name for name in FILES]
+    pages = (PAGE, *PICTURES) if real is not None else ()
+    files = [folder / name for name in (*FILES, *pages)]
     line = f"{folder}: {len(found['cells'])} cells\n\n{brief(found['cells'])}"
-    then = f"open {folder / 'bench.md'}; a method of your own: --questions, then --answers"
-    return Outcome(line, {**found, "files": files}, then=then)
+    line += "".join(f"\nnot read: {reason}" for reason in declined.values())
+    first = folder / (PAGE if real is not None else "bench.md")
+    then = f"open {first}; a method of your own: --questions, then --answers"
+    data = {**found, "files": files} | ({"declined": declined} if real is not None else {})
+    return Outcome(line, data, then=then)
 
 
 FILES = (
