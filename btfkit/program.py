@@ -4,9 +4,10 @@ A `Program` is read by whatever evaluates a material without its class: the plai
 (`native.neural.plain`), the kernels, exporters, the page viewer and renderers' plugins. It holds
 arrays, no code. In order, for a query (uv, light, view, footprint, curvature):
 
+0. cover: where a network says that the view ray passes, opacity is 0 and nothing else counts.
 1. depth: where the view ray meets the heights (on a curved surface `native.neural.bent` says
    where), or what the depth network says, times `displacement(view)` moves uv; textures with a
-   `light` part move along the light, too.
+   `light` part move along the light, too. An offset network moves uv by what it says itself.
 2. textures: bilinear between texel centres, between levels by log2(2 x footprint) - shift.
 3. frames: three features of the first texture each, as vectors.
 4. inputs: one number a name, in order; on curved heights light and view are in the frame where
@@ -25,7 +26,7 @@ from btfkit.conventions import INPUTS
 
 Floats = NDArray[Any]
 Activation = Literal["linear", "relu", "leaky", "sine"]
-Output = Literal["log", "relu", "released", "cosine"]
+Output = Literal["log", "relu", "released", "cosine", "linear"]
 HeadKind = Literal["log", "mask", "opacity", "linear"]
 
 
@@ -110,6 +111,39 @@ class DepthNetwork:
 
 
 @final
+@dataclass(frozen=True, eq=False)
+class OffsetNetwork:
+    """How far textures with a `view` part are looked up from uv: two numbers of a network.
+
+    Attributes:
+        texture: its one level is looked up at uv.
+        inputs: names of what the first layer takes. layers: to (du, dv), tiles.
+    """
+
+    texture: Texture
+    inputs: tuple[str, ...]
+    layers: tuple[Dense, ...]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Cover:
+    """Opacity from a texture and a network of its own.
+
+    Attributes:
+        kind: "direct" the sigmoid of its number; "cosine" 1 where the view's cosine is no lower
+            than the number, and else 0.
+        texture: its one level is looked up at uv.
+        inputs: names of what the first layer takes. layers: to one number.
+    """
+
+    kind: Literal["direct", "cosine"]
+    texture: Texture
+    inputs: tuple[str, ...]
+    layers: tuple[Dense, ...]
+
+
+@final
 @dataclass(frozen=True)
 class Head:
     """Some of the last layer's numbers.
@@ -140,8 +174,10 @@ class Program:
         heads: what the last numbers are, in order.
         output: "log" exp - 1 of the log head, cut to 0..MOST_LOG first; "relu" the same, negative
             numbers being cut already in training; "released" YUV to RGB first, as the published
-            program of NeuMIP has it; "cosine" the linear head times the light's cosine.
+            program of NeuMIP has it; "cosine" the linear head times the light's cosine; "linear" it
+            with negative numbers cut.
         depth: what moves lookups; None where nothing does.
+        cover: what says where view rays pass; None where the march, or a head, says it.
         frames: vectors among the first texture's features.
         scaling: texture of (mean, deviation) that the log head is scaled by; None without.
         leveled: whether footprints count; where they do not, each query is one of 0.5.
@@ -162,7 +198,8 @@ class Program:
     layers: tuple[Dense, ...]
     heads: tuple[Head, ...]
     output: Output
-    depth: Heights | DepthNetwork | None = None
+    depth: Heights | DepthNetwork | OffsetNetwork | None = None
+    cover: Cover | None = None
     frames: int = 0
     scaling: Texture | None = None
     leveled: bool = True
@@ -191,8 +228,10 @@ class Program:
         return (*named, *frame_products(self.frames))
 
     @property
-    def opacity(self) -> Literal["none", "march", "head"]:
-        """Where opacity comes from: nowhere (it is 1), rays that miss, or the last layer."""
+    def opacity(self) -> Literal["none", "march", "head", "network"]:
+        """Where opacity comes from: nowhere (it is 1), rays that miss, a layer, a network."""
+        if self.cover is not None:
+            return "network"
         if any(head.kind == "opacity" for head in self.heads):
             return "head"
         return "march" if isinstance(self.depth, Heights) and self.depth.curved else "none"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.program import Heights, Program, Texture
+from btfkit.program import DepthNetwork, Heights, OffsetNetwork, Program, Texture
 
 Array = NDArray[Any]
 
@@ -36,12 +36,17 @@ def textures(program: Program) -> Iterator[Texture]:
     yield from program.textures
     if program.scaling:
         yield program.scaling
-    if program.depth is not None and not isinstance(program.depth, Heights):
+    if isinstance(program.depth, DepthNetwork):
         yield program.depth.texture
 
 
 def refuse_unknown(program: Program) -> None:
     """TypeError for what no exporter knows how to write."""
+    if program.cover is not None or isinstance(program.depth, OffsetNetwork):
+        raise TypeError(
+            "this material has networks of opacity and offset of its own, which no export has; "
+            "expected one whose rays end at heights or by a network of depth"
+        )
     if isinstance(program.depth, Heights) and program.depth.curved:
         raise TypeError(
             "the view ray of this material bends with curvature, which no export has; "

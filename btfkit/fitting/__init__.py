@@ -13,6 +13,7 @@ TRAINED: dict[str, str] = {
     "neumip": "btfkit.fitting.neumip.trainable:NeuMIP",
     "neumip-paper": "btfkit.fitting.neumip.paper:NeuMIPPaper",
     "sbtf": "btfkit.fitting.sbtf.trainable:SBTF",
+    "sbtf-paper": "btfkit.fitting.sbtf.paper:SBTFPaper",
     "neubtf": "btfkit.fitting.neubtf.trainable:NeuBTF",
     "neubtf-paper": "btfkit.fitting.neubtf.paper:NeuBTFPaper",
 }
@@ -25,7 +26,10 @@ CLOSED_FORM: dict[str, str] = {
 MODELS: dict[str, str] = {**CLOSED_FORM, **TRAINED}
 # Models that learn of a relief from queries: functions (relief, *, seed) -> QuerySet. All others
 # learn from a BTF of it.
-TRACED: dict[str, str] = {"sbtf": "btfkit.fitting.sbtf.tracing:queries_of"}
+TRACED: dict[str, str] = {
+    "sbtf": "btfkit.fitting.sbtf.tracing:queries_of",
+    "sbtf-paper": "btfkit.fitting.sbtf.tracing:queries_of",
+}
 # What `--set` reaches of each; none of these modules needs torch.
 SETTINGS: dict[str, str] = {
     "lambert": "btfkit.fitting.lambert:Settings",
@@ -36,6 +40,7 @@ SETTINGS: dict[str, str] = {
     "neumip": "btfkit.fitting.neumip.settings:Settings",
     "neumip-paper": "btfkit.fitting.neumip.settings:Settings",
     "sbtf": "btfkit.fitting.sbtf.settings:Settings",
+    "sbtf-paper": "btfkit.fitting.sbtf.settings:PaperSettings",
     "neubtf": "btfkit.fitting.neubtf.settings:Settings",
     "neubtf-paper": "btfkit.fitting.neubtf.settings:PaperSettings",
 }

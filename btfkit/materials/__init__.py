@@ -17,6 +17,7 @@ MODELS: dict[str, str] = {
     "neumip": "btfkit.materials.neumip.material:NeuMIP",
     "neumip-paper": "btfkit.materials.neumip.material:NeuMIPPaper",
     "sbtf": "btfkit.materials.sbtf.material:SBTF",
+    "sbtf-paper": "btfkit.materials.sbtf.paper:SBTFPaper",
 }
 # Models whose `program()` gives their evaluation as data.
 PROGRAMS: tuple[str, ...] = (
@@ -28,6 +29,7 @@ PROGRAMS: tuple[str, ...] = (
     "neumip",
     "neumip-paper",
     "sbtf",
+    "sbtf-paper",
 )
 
 

@@ -38,6 +38,7 @@ TINY: dict[str, tuple[int, dict[str, str]]] = {
     "neumip": (150, {"batch": "1024", "levels": "1"}),
     "neumip-paper": (150, {"batch": "1024", "levels": "1"}),
     "sbtf": (150, {"batch": "1024", "levels": "1"}),
+    "sbtf-paper": (60, {"batch": "1024", "rate": "2e-2"}),
     "neubtf": (150, {"batch": "1024", "free": "0.9", "kept": "false"}),
     "neubtf-paper": (150, {"pairs": "8", "texels": "64", "encoder": "false"}),
 }

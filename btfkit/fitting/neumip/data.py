@@ -29,7 +29,7 @@ _HELD_PAIRS = 16
 class Batch:
     """b queries with answers; footprint None is 0.5 throughout, weight None is 1.
 
-    curvature None is the plane.
+    curvature None is the plane. rows (b,) are those of the query file, None of textures.
     """
 
     uv: Array
@@ -39,6 +39,7 @@ class Batch:
     target: Array
     weight: Array | None = None
     curvature: Array | None = None
+    rows: NDArray[np.intp] | None = None
 
     def __len__(self) -> int:
         return len(self.uv)
@@ -241,15 +242,16 @@ def _rows(queries: QuerySet, rows: NDArray[np.intp], *, curved: bool) -> Batch:
             target = np.where(queries.opacity[rows, None] < 0.5, np.float32(np.nan), target)
         if queries.curvature is not None and queries.curvature.any():
             bend = queries.curvature[rows]
-    return Batch(queries.uv[rows], light, view, footprint, target, weight, bend)
+    return Batch(queries.uv[rows], light, view, footprint, target, weight, bend, rows)
 
 
 def _cut(rows: Batch, at: slice) -> Batch:
     footprint = None if rows.footprint is None else rows.footprint[at]
     weight = None if rows.weight is None else rows.weight[at]
     bend = None if rows.curvature is None else rows.curvature[at]
+    place = None if rows.rows is None else rows.rows[at]
     view, target = rows.view[at], rows.target[at]
-    return Batch(rows.uv[at], rows.light[at], view, footprint, target, weight, bend)
+    return Batch(rows.uv[at], rows.light[at], view, footprint, target, weight, bend, place)
 
 
 def _nothing(channels: int) -> Batch:

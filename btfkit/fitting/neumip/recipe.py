@@ -47,8 +47,8 @@ class Recipe(Trainable, ABC, Generic[S]):
         self.settings = s = parsed(self.settings_type, self.model, settings)
         refuse_unused(s, self.model, settings, pictures=isinstance(source, BTF))
         self._generators, self._data = generators, source
-        self._header = _header(source, s)
-        size = _texture_size(self._header.grid, s.size)
+        self._header = header_of(source, s)
+        size = texture_size(self._header.grid, s.size)
         levels = s.levels or _levels_for(source, size)
         self.spec = self._spec(size, min(levels, most_levels(size)))
         self.layout = self.spec.layout(self._header)
@@ -126,7 +126,12 @@ class Recipe(Trainable, ABC, Generic[S]):
         self._count_from(state["numbers"])
 
 
-def _header(source: BTF | QuerySet, settings: Shared) -> Header:
+def header_of(source: BTF | QuerySet, settings: Shared) -> Header:
+    """What a material of the data says about itself.
+
+    Raises:
+        FitError: queries that do not say the size of the grid, and no setting does.
+    """
     if isinstance(source, BTF):
         return Header.of(source)
     if source.size is None:
@@ -145,7 +150,8 @@ def _header(source: BTF | QuerySet, settings: Shared) -> Header:
     return Header(grid=grid, channels=source.channels, wrap=wrap)
 
 
-def _texture_size(grid: tuple[int, int], rows: int) -> tuple[int, int]:
+def texture_size(grid: tuple[int, int], rows: int) -> tuple[int, int]:
+    """(h, w) of textures with `rows` rows; 0 rows: those of the grid."""
     if not rows:
         return grid
     return rows, max(round(rows * grid[1] / grid[0]), 1)

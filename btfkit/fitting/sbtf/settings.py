@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import final
 
-from btfkit.fitting.neumip.settings import Stepped
+from btfkit.fitting.neumip.settings import Shared, Stepped
 
 
 @final
@@ -28,3 +29,44 @@ class Settings(Stepped):
         super().__post_init__()
         if self.heights not in ("auto", "found", "given"):
             raise ValueError(f"heights = {self.heights!r}; expected one of auto, found, given")
+
+
+@final
+@dataclass(frozen=True)
+class PaperSettings(Shared):
+    """What `sbtf-paper` takes beside what all recipes do.
+
+    Attributes:
+        features: channels of each of the three textures.
+        width: of the hidden layers.
+        opacity: "cosine" learns the cosine of the silhouette, "direct" the opacity; "auto" the
+            cosine where a relief without holes tells it.
+        supervised: whether the offset learns from where the rays of a known relief end.
+        offset_curvature: whether the offset network takes the curvature.
+        offset_loss: weight of the offset's loss, which counts tiles.
+        rate: Adam's.
+    """
+
+    features: int = 7
+    width: int = 24
+    opacity: str = "auto"
+    supervised: bool = True
+    offset_curvature: bool = True
+    offset_loss: float = 1.0
+    rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.opacity not in ("auto", "cosine", "direct"):
+            raise ValueError(f"opacity = {self.opacity!r}; expected one of auto, cosine, direct")
+        if self.precision == "int8":
+            raise ValueError("precision = 'int8'; expected float32 or float16")
+        for name, low, high in (
+            ("features", 1, 32), ("width", 1, 128), ("offset_loss", 0, 1e6), ("rate", 0, 1),
+        ):  # fmt: skip
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name} = {getattr(self, name)}; expected {low} to {high}")
+
+    def unused(self, given: Mapping[str, str], *, pictures: bool) -> dict[str, str]:
+        own = {"levels": "it has a single resolution"} if self.levels > 1 else {}
+        return own | super().unused(given, pictures=pictures)

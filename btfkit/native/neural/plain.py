@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,15 @@ from btfkit.conventions import (
 from btfkit.native.neural import bent
 from btfkit.native.neural.layout import Layout, Networks
 from btfkit.native.neural.lookup import bilinear
-from btfkit.program import Dense, DepthNetwork, Heights, Program, Texture, frame_products
+from btfkit.program import (
+    Cover,
+    Dense,
+    DepthNetwork,
+    OffsetNetwork,
+    Program,
+    Texture,
+    frame_products,
+)
 
 Array = NDArray[Any]
 Known = dict[str, Array]
@@ -45,6 +54,8 @@ def answer(
         footprint: (b,) texels of the data's grid; None is 0.5 throughout.
         curvature: (b,) 1/tile width; None is the plane.
     """
+    if program.cover is not None:
+        return _covered(program, program.cover, uv, light, view, footprint, curvature)
     raw, scaled, (opacity, lit) = _last_layer(program, uv, light, view, footprint, curvature)
     heads = _heads(program, raw)
     if "opacity" in heads:
@@ -55,12 +66,35 @@ def answer(
     return rgb, opacity
 
 
+def _covered(
+    program: Program,
+    cover: Cover,
+    uv: Array,
+    light: Array,
+    view: Array,
+    footprint: Array | None,
+    curvature: Array | None,
+) -> tuple[Array, Array]:
+    """`answer` of those that a network of opacity lets be seen; the others stop there."""
+    found = _looked_up(program, cover, uv, view, curvature)[:, 0]
+    opacity = _sigmoid(found) if cover.kind == "direct" else (view[:, 2] >= found)
+    opacity = opacity.astype(found.dtype)
+    rgb = np.zeros((len(uv), len(program.channels)), found.dtype)
+    seen = np.flatnonzero(opacity > 0)
+    blur, bend = (None if part is None else part[seen] for part in (footprint, curvature))
+    rest = replace(program, cover=None)
+    rgb[seen] = answer(rest, uv[seen], light[seen], view[seen], blur, bend)[0]
+    return rgb, opacity
+
+
 def _reflectance(
     program: Program, heads: Mapping[str, Array], scaled: Array | None, light: Array
 ) -> Array:
     """(b, c) of the heads' numbers."""
     if program.output == "cosine":
         return heads["linear"] * light[:, 2:]
+    if program.output == "linear":
+        return np.maximum(heads["linear"], 0)
     if program.output == "released":
         return released(heads["log"], heads["mask"])
     y = heads["log"]
@@ -98,10 +132,10 @@ def marched(
     """Ray depth (b,) as `depths`, opacity (b,) and turn (b,) as `bent.Crossing` has them."""
     found, dtype = program.depth, program.textures[0].levels[0].dtype
     opacity, turn = np.ones(len(uv), dtype), np.zeros(len(uv), dtype)
-    if found is None:
+    if found is None or isinstance(found, OffsetNetwork):
         return np.zeros(len(uv), dtype), opacity, turn
-    if not isinstance(found, Heights):
-        return _network_depths(program, found, uv, view), opacity, turn
+    if isinstance(found, DepthNetwork):
+        return _looked_up(program, found, uv, view, None)[:, 0] * found.scale, opacity, turn
     along = ray(view, program.aspect, found.scale)
     met = crossing(found.heights, uv, along, wrap=program.wrap)
     depth = met * lift(view) * found.scale
@@ -112,11 +146,18 @@ def marched(
     return depth, opacity, turn
 
 
-def _network_depths(program: Program, found: DepthNetwork, uv: Array, view: Array) -> Array:
+def _looked_up(
+    program: Program,
+    found: DepthNetwork | OffsetNetwork | Cover,
+    uv: Array,
+    view: Array,
+    curvature: Array | None,
+) -> Array:
+    """The numbers (b, n) of a network with a texture of its own, which knows no light."""
     psi = bilinear(found.texture.levels[0], uv, wrap=program.wrap)
-    known = _known(view, view, None, None) | _columns(found.texture, psi)
+    known = _known(view, view, None, curvature) | _columns(found.texture, psi)
     known |= _on_discs(found.inputs, view, view)
-    return _run(found.layers, found.inputs, known, rounded=program.rounded)[:, 0] * found.scale
+    return _run(found.layers, found.inputs, known, rounded=program.rounded)
 
 
 def evaluate_plain(
@@ -265,6 +306,8 @@ def _last_layer(
     """
     depth, opacity, turn = marched(program, uv, view, curvature)
     toward, away = step(view, program.aspect), step(light, program.aspect)
+    if isinstance(program.depth, OffsetNetwork):
+        offset = _looked_up(program, program.depth, uv, view, curvature)
     if turn.any():
         light, view = (bent.turned(direction, view, turn) for direction in (light, view))
         view[:, 2] = np.where(turn == 0, view[:, 2], np.maximum(view[:, 2], LOWEST_SEEN))
@@ -274,7 +317,9 @@ def _last_layer(
     values = []
     for texture in every:
         moved = uv
-        if program.depth is not None and (texture.view or texture.light):
+        if isinstance(program.depth, OffsetNetwork) and texture.view:
+            moved = uv + texture.view * offset
+        elif program.depth is not None and (texture.view or texture.light):
             moved = uv + depth[:, None] * (texture.view * toward - texture.light * away)
         values.append(_between_levels(texture, moved, known["level"] * LEVELS_UNIT, program.wrap))
     for texture, found in zip(program.textures, values, strict=False):
