@@ -41,6 +41,8 @@ def _next(target: str, out: Path) -> str:
         "cpp": f"cd {folder} && c++ -O3 -std=c++17 example.cpp -o example && ./example",
         "glsl": f"open {folder}/example.html in a browser",
         "exr": f"python {folder}/evaluate.py queries.npz answers.npz",
+        "wgsl": f"python {folder}/evaluate.py queries.npz answers.npz",
+        "slang": f"python {folder}/compile.py",
         "onnx": f"python {folder}/evaluate.py queries.npz answers.npz",
         "three": f"cd {folder} && npm install && python -m http.server, then open it in a browser",
     }[target]

@@ -10,4 +10,6 @@ TARGETS: dict[str, str] = {
     "exr": "btfkit.export.exr:write",
     "three": "btfkit.export.three:write",
     "onnx": "btfkit.export.onnx:write",
+    "wgsl": "btfkit.export.wgsl:write",
+    "slang": "btfkit.export.slang:write",
 }

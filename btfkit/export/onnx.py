@@ -250,7 +250,7 @@ class _Evaluation:
         half = narrowed(texture.reshape(h * w, k))
         flat = self.graph.array(half, half.dtype)
         flat = flat.cast(_FLOAT) if half.dtype == np.float16 else flat
-        width, columns = (self.graph.array(n, np.int64) for n in (w, [1]))
+        width = self.graph.array(w, np.int64)
 
         def row(y: Value) -> Value:
             found = []

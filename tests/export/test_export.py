@@ -232,7 +232,7 @@ def test_a_quantised_program_is_off_by_half_a_step(texels: Any, step: float) -> 
 def test_what_no_export_knows_is_refused_by_name(tmp_path: Path) -> None:
     material = made("lambert")
     with pytest.raises(
-        ValueError, match="no target 'pdf'; there are npz, cpp, glsl, exr, three, onnx"
+        ValueError, match="no target 'pdf'; there are npz, cpp, glsl, exr, three, onnx, wgsl, slang"
     ):
         export(material, "pdf", tmp_path / "out")
     btf = synth_btf("knit", size=8, lights="3", views="3", samples=1)

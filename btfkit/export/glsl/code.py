@@ -19,7 +19,7 @@ from btfkit.native.neural.plain import YUV_TO_RGB
 from btfkit.program import DepthNetwork, Heights, Program, Texture
 
 # Vectors of a query, four numbers each, under the names that `conventions.INPUTS` has.
-_VECTORS = (
+VECTORS = (
     Source("vec4(light, 0.0)", ("lx", "ly", "lz", "")),
     Source("vec4(view, 0.0)", ("vx", "vy", "vz", "")),
     Source("vec4(halfway, cos_diff)", ("hx", "hy", "hz", "cos_diff")),
@@ -106,8 +106,8 @@ def _values(program: Program, model: str) -> dict[str, object]:
 
 def _look(texture: Texture, atlas: Atlas) -> str:
     """The function that reads all channels of a texture, between levels where it has some."""
-    places, name = atlas.places[texture.name], _name(texture)
-    groups, n = _group_count(texture), len(places)
+    places, name = atlas.places[texture.name], variable(texture)
+    groups, n = groups_of(texture), len(places)
     out = ", ".join(f"out vec4 {name}_{g}" for g in range(groups))
     low, step = (x[texture.name].reshape(-1, 4) for x in (atlas.low, atlas.step))
     corners = ", ".join(f"ivec3({p.x}, {p.y}, {p.layer})" for p in places)
@@ -144,35 +144,38 @@ def _look(texture: Texture, atlas: Atlas) -> str:
     return "\n".join([*lines, "}", ""])
 
 
-def _name(texture: Texture) -> str:
+def variable(texture: Texture) -> str:
+    """What variables of a texture begin with."""
     return "t_" + "".join(c if c.isalnum() else "x" for c in texture.name)
 
 
-def _group_count(texture: Texture) -> int:
+def groups_of(texture: Texture) -> int:
+    """Groups of four channels."""
     return -(-texture.levels[0].shape[-1] // 4)
 
 
-def _sources(texture: Texture) -> list[Source]:
+def sources_of(texture: Texture) -> list[Source]:
+    """The variables that hold a texture's features."""
     names = [*texture.features]
     names += [""] * (-len(names) % 4)
     return [
-        Source(f"{_name(texture)}_{g}", tuple(names[4 * g : 4 * g + 4]))
-        for g in range(_group_count(texture))
+        Source(f"{variable(texture)}_{g}", tuple(names[4 * g : 4 * g + 4]))
+        for g in range(groups_of(texture))
     ]
 
 
 def _called(texture: Texture, place: str, level: str) -> list[str]:
-    variables = [source.text for source in _sources(texture)]
+    variables = [source.text for source in sources_of(texture)]
     return [
         f"vec4 {', '.join(variables)};",
-        f"btfkit_look_{_name(texture)}({place}, {level}, {', '.join(variables)});",
+        f"btfkit_look_{variable(texture)}({place}, {level}, {', '.join(variables)});",
     ]
 
 
 def _vectors(inputs: Iterable[str], prefix: str) -> tuple[list[str], list[Source]]:
     """Variables for the vectors that inputs are taken from."""
     wanted, lines, found = set(inputs), [], []
-    for k, source in enumerate(_VECTORS):
+    for k, source in enumerate(VECTORS):
         if wanted & {name for name in source.names if name}:
             lines.append(f"vec4 {prefix}{k} = {source.text};")
             found.append(Source(f"{prefix}{k}", source.names))
@@ -185,7 +188,7 @@ def _depth(program: Program, wide: Weights | None) -> list[str]:
         return []
     lines, sources = _vectors(found.inputs, "dq")
     some, scalars = layers.lines(
-        "d", found.layers, found.inputs, [*_sources(found.texture), *sources],
+        "d", found.layers, found.inputs, [*sources_of(found.texture), *sources],
         rounded=program.rounded, wide=wide,
     )  # fmt: skip
     looked = _called(found.texture, "uv", "0.0")
@@ -207,9 +210,9 @@ def _features(program: Program) -> list[str]:
 
 def _answer(program: Program, wide: Weights | None) -> list[str]:
     lines, sources = _vectors(program.inputs, "q")
-    sources = [s for texture in program.textures for s in _sources(texture)] + sources
+    sources = [s for texture in program.textures for s in sources_of(texture)] + sources
     for f in range(program.frames):
-        first = _sources(program.textures[0])
+        first = sources_of(program.textures[0])
         axis = ", ".join(
             layers.component(program.textures[0].features[3 * f + k], first) for k in range(3)
         )
@@ -226,40 +229,41 @@ def _answer(program: Program, wide: Weights | None) -> list[str]:
 
 
 def _output(program: Program, heads: dict[str, list[str]]) -> list[str]:
-    c, most = len(program.channels), literal(MOST_LOG)
     lines: list[str] = []
+    if "opacity" in heads:
+        lines += [
+            f"opacity = btfkit_sigmoid({heads['opacity'][0]});",
+            "if (!(opacity > 0.0)) return;",
+        ]
+    return lines + [f"value[{k}] = {x};" for k, x in enumerate(reflectance(program, heads))]
+
+
+def reflectance(program: Program, heads: dict[str, list[str]]) -> list[str]:
+    """Each channel's reflectance as text, in GLSL and in what is like it."""
+    c, most = len(program.channels), literal(MOST_LOG)
     if program.output == "cosine":
-        values = [f"{x} * light.z" for x in heads["linear"]]
-    elif program.output == "released":
+        return [f"{x} * light.z" for x in heads["linear"]]
+    if program.output == "released":
         logs = [f"min({x}, {most})" for x in heads["log"]]
         sums = [
             " + ".join(f"{literal(m)} * {x}" for m, x in zip(row, logs, strict=True))
             for row in YUV_TO_RGB
         ]
         masks = [f"(0.1 + btfkit_sigmoid({x}))" for x in heads["mask"]]
-        values = [
+        return [
             f"max((exp(min({y}, {most})) - 1.0) * {mask}, 0.0)"
             for y, mask in zip(sums, masks, strict=True)
         ]
-    else:
-        logs = heads["log"]
-        if program.scaling:
-            white = _sources(program.scaling)
-            names = program.scaling.features
-            logs = [
-                f"({layers.component(names[k], white)} + "
-                f"{layers.component(names[c + k], white)} * {x})"
-                for k, x in enumerate(logs)
-            ]
-        if "mask" in heads:
-            logs = [
-                f"{y} * (0.1 + btfkit_sigmoid({m}))"
-                for y, m in zip(logs, heads["mask"], strict=True)
-            ]
-        values = [f"exp(clamp({y}, 0.0, {most})) - 1.0" for y in logs]
-    if "opacity" in heads:
-        lines += [
-            f"opacity = btfkit_sigmoid({heads['opacity'][0]});",
-            "if (!(opacity > 0.0)) return;",
+    logs = heads["log"]
+    if program.scaling:
+        white = sources_of(program.scaling)
+        names = program.scaling.features
+        logs = [
+            f"({layers.component(names[k], white)} + {layers.component(names[c + k], white)} * {x})"
+            for k, x in enumerate(logs)
         ]
-    return lines + [f"value[{k}] = {value};" for k, value in enumerate(values)]
+    if "mask" in heads:
+        logs = [
+            f"{y} * (0.1 + btfkit_sigmoid({m}))" for y, m in zip(logs, heads["mask"], strict=True)
+        ]
+    return [f"exp(clamp({y}, 0.0, {most})) - 1.0" for y in logs]

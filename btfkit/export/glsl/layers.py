@@ -71,11 +71,11 @@ def lines(
     used = [source for source in sources if any(n in inputs for n in source.names)]
     found: list[str] = []
     before = [source.text for source in used]
-    matrix = _arranged(layers[0].weight, inputs, used)
+    matrix = arranged(layers[0].weight, inputs, used)
     for k, layer in enumerate(layers):
         cut = rounded and k + 1 < len(layers)
         if k:
-            matrix = _padded(layer.weight, 4 * len(before))
+            matrix = padded(layer.weight, 4 * len(before))
         own = f"{name}{k + 1}"
         if wide is None:
             some, before = _literal_layer(own, layer, matrix, before, rounded=cut)
@@ -102,7 +102,7 @@ def vec4(values: Any) -> str:
 def _literal_layer(
     own: str, layer: Dense, matrix: Array, before: list[str], *, rounded: bool
 ) -> tuple[list[str], list[str]]:
-    bias, groups = _groups(layer.bias), matrix.shape[0] // 4
+    bias, groups = grouped(layer.bias), matrix.shape[0] // 4
     names = [f"{own}_{o}" for o in range(groups)]
     found = []
     for o, name in enumerate(names):
@@ -125,14 +125,14 @@ def _normal_lines(own: str, layer: Dense, names: list[str]) -> list[str]:
     n, one = len(layer.bias), "vec4(1.0)"
     assert layer.gain is not None
     assert layer.centre is not None
-    masks = _groups(np.ones(n))
+    masks = grouped(np.ones(n))
     total = " + ".join(f"dot({x}, {one})" for x in names)
     found = [f"float {own}_mean = ({total}) / {literal(n)};"]
     found += [f"{x} = ({x} - {own}_mean) * {vec4(m)};" for x, m in zip(names, masks, strict=True)]
     square = " + ".join(f"dot({x}, {x})" for x in names)
     scale = f"inversesqrt(({square}) / {literal(n)} + {literal(EPSILON)})"
     found.append(f"float {own}_scale = {scale};")
-    for x, gain, centre in zip(names, _groups(layer.gain), _groups(layer.centre), strict=True):
+    for x, gain, centre in zip(names, grouped(layer.gain), grouped(layer.centre), strict=True):
         found.append(f"{x} = {x} * {own}_scale * {vec4(gain)} + {vec4(centre)};")
     return found
 
@@ -144,7 +144,7 @@ def _wide_layer(
     groups, width = matrix.shape[0] // 4, matrix.shape[1] // 4
     # Per output group: for each input group its four columns.
     blocks = matrix.reshape(groups, 4, width, 4).transpose(0, 2, 3, 1)
-    at, bias = wide.place(blocks), wide.place(_groups(layer.bias))
+    at, bias = wide.place(blocks), wide.place(grouped(layer.bias))
     x = before[0].split("[")[0]
     found = []
     if not before[0].startswith(f"{x}[0]"):
@@ -180,20 +180,21 @@ def activated(layer: Dense, z: str, before: str, *, rounded: bool) -> str:
     return before + (f"btfkit_rounded({value})" if rounded else value)
 
 
-def _groups(values: Array) -> Array:
+def grouped(values: Array) -> Array:
     """(g, 4) of (n,), zeros after the last."""
     found = np.zeros(-(-len(values) // 4) * 4, np.float32)
     found[: len(values)] = values
     return found.reshape(-1, 4)
 
 
-def _padded(matrix: Array, columns: int) -> Array:
+def padded(matrix: Array, columns: int) -> Array:
+    """The matrix with zeros up to a number of columns, and up to whole groups of rows."""
     found = np.zeros((-(-matrix.shape[0] // 4) * 4, columns), np.float32)
     found[: matrix.shape[0], : matrix.shape[1]] = matrix
     return found
 
 
-def _arranged(matrix: Array, inputs: Sequence[str], sources: Sequence[Source]) -> Array:
+def arranged(matrix: Array, inputs: Sequence[str], sources: Sequence[Source]) -> Array:
     """The matrix with its columns where the sources have the inputs."""
     found = np.zeros((-(-matrix.shape[0] // 4) * 4, 4 * len(sources)), np.float32)
     at = {n: 4 * s + k for s, source in enumerate(sources) for k, n in enumerate(source.names) if n}

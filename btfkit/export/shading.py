@@ -1,0 +1,311 @@
+"""A program as one function over buffers, in WGSL and in Slang: they differ in spelling alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from btfkit.conventions import EPSILON, LEAK, LOOKS, LOWEST_COSINE, STEEPEST
+from btfkit.export.arrays import narrowed
+from btfkit.export.glsl.code import VECTORS, groups_of, reflectance, sources_of, variable
+from btfkit.export.glsl.layers import Source, Weights, arranged, component, grouped, padded
+from btfkit.export.numbers import literal
+from btfkit.export.sections import filled, sections
+from btfkit.program import Dense, DepthNetwork, Heights, Program, Texture
+
+Array = NDArray[Any]
+Language = Literal["wgsl", "slang"]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Shaded:
+    """A function, and the buffers that it reads.
+
+    Attributes:
+        text: of the function `btfkit_evaluate` and what it calls.
+        buffers: bytes by name, in the order of their bindings: `weights` and `heights` float32,
+            `texels` in float16 where that loses nothing, else float32. None is empty.
+    """
+
+    text: str
+    buffers: dict[str, bytes]
+
+
+def shaded(program: Program, language: Language, *, model: str) -> Shaded:
+    """The function of a program in a language, and its buffers."""
+    return _Writer(program, language).written(model)
+
+
+class _Writer:
+    """Statements of one function, and the numbers that they read."""
+
+    def __init__(self, program: Program, language: Language) -> None:
+        self.program, self.language = program, language
+        self.weights = Weights()
+        self.texels: list[Array] = []
+        self.functions: list[str] = []
+        self._at = 0
+        every = [level for texture in _textures(program) for level in texture.levels]
+        self._half = all(narrowed(level).dtype == np.float16 for level in every)
+
+    def written(self, model: str) -> Shaded:
+        program = self.program
+        body = [*self._depth(), *self._features(), *self._answer()]
+        parts = sections(f"material.{self.language}.txt")
+        first, last = _chosen(program, half=self._half)
+        buffers: dict[str, bytes] = {}
+        if self.weights.rows:
+            buffers["weights"] = np.asarray(self.weights.rows, "<f4").tobytes()
+        texels = np.concatenate([array.reshape(-1) for array in self.texels])
+        buffers["texels"] = texels.astype("<f2" if self._half else "<f4").tobytes()
+        if isinstance(program.depth, Heights):
+            buffers["heights"] = program.depth.heights.astype("<f4").tobytes()
+        named = [*buffers]
+        declared = "".join(
+            filled(parts[f"buffer_{name}_half" if name == "texels" and self._half
+                         else f"buffer_{name}"], binding=k)
+            for k, name in enumerate(named)
+        )  # fmt: skip
+        values = _values(program, model)
+        text = filled(parts["start"], **values) + declared
+        text += filled("".join(parts[name] for name in first), **values)
+        text += "".join(self.functions)
+        text += filled("".join(parts[name] for name in last), **values)
+        text += "".join(f"  {line}\n" for line in body) + parts["end"]
+        return Shaded(text, buffers)
+
+    # What both languages spell in their own way.
+
+    def _vec4(self, values: Any) -> str:
+        return f"{self._type(4)}({', '.join(literal(value) for value in values)})"
+
+    def _type(self, n: int) -> str:
+        return f"vec{n}f" if self.language == "wgsl" else f"float{n}"
+
+    def _made(self, name: str, value: str, n: int = 4) -> str:
+        """A variable of n numbers."""
+        kind = "var" if self.language == "wgsl" else ("float" if n == 1 else self._type(n))
+        return f"{kind} {name} = {value};"
+
+    def _array(self, name: str, n: int, values: Sequence[str] = ()) -> str:
+        if self.language == "wgsl":
+            kind = f"array<vec4f, {n}>"
+            return (
+                f"var {name} = {kind}({', '.join(values)});" if values else f"var {name}: {kind};"
+            )
+        return f"float4 {name}[{n}]" + (f" = {{{', '.join(values)}}};" if values else ";")
+
+    def _loop(self, index: str, n: int, lines: Sequence[str]) -> list[str]:
+        kind = "var" if self.language == "wgsl" else "int"
+        start = f"for ({kind} {index} = 0; {index} < {n}; {index}++) {{"
+        return [start, *(f"  {line}" for line in lines), "}"]
+
+    def _int(self, value: str) -> str:
+        return f"i32({value})" if self.language == "wgsl" else f"int({value})"
+
+    def _level_function(self, name: str, places: list[tuple[int, int, int]]) -> str:
+        wgsl, last = self.language == "wgsl", len(places) - 1
+        kind = "vec3i" if wgsl else "int3"
+        start = f"fn {name}(n: i32) -> vec3i {{" if wgsl else f"int3 {name}(int n) {{"
+        lines = [start, "  switch (n) {"]
+        for k, place in enumerate(places):
+            case = "default" if k == last else f"case {k}"
+            lines.append(f"    {case}: {{ return {kind}{place}; }}")
+        return "\n".join([*lines, "  }", "}", ""])
+
+    # The evaluation.
+
+    def _placed(self, texture: Texture) -> list[str]:
+        """Puts a texture's levels into the buffer; statements for variables of its features."""
+        name, groups = variable(texture), groups_of(texture)
+        places = []
+        for level in texture.levels:
+            h, w, k = level.shape
+            held = np.zeros((h, w, groups * 4), np.float32)
+            held[..., :k] = level
+            places.append((self._at, w, h))
+            self.texels.append(held)
+            self._at += h * w * groups
+        self.functions.append(self._level_function(f"btfkit_level_{name}", places))
+        return [f"{name}_{g}" for g in range(groups)]
+
+    def _looked(self, texture: Texture, place: str, level: str) -> list[str]:
+        names, n = self._placed(texture), len(texture.levels)
+        own, groups = variable(texture), groups_of(texture)
+        lines = [self._made(f"{own}_uv", place, 2)]
+        finer = "0"
+        if n > 1:
+            at = f"clamp({level} - {literal(texture.shift)}, 0.0, {n - 1}.0)"
+            lines += [self._made(f"{own}_at", at, 1)]
+            lines += [self._made(f"{own}_finer", f"floor({own}_at)", 1)]
+            lines += [self._made(f"{own}_share", f"{own}_at - {own}_finer", 1)]
+            finer = self._int(f"{own}_finer")
+        look = f"btfkit_lookup(btfkit_level_{own}({{}}), {groups}, {{}}, {own}_uv)"
+        lines += [self._made(name, look.format(finer, g)) for g, name in enumerate(names)]
+        if n > 1:
+            lines.append(f"if ({own}_share > 0.0) {{")
+            for g, name in enumerate(names):
+                coarser = look.format(f"{finer} + 1", g)
+                lines.append(f"  {name} += {own}_share * ({coarser} - {name});")
+            lines.append("}")
+        return lines
+
+    def _vectors(self, inputs: Sequence[str], prefix: str) -> tuple[list[str], list[Source]]:
+        lines, found = [], []
+        for k, source in enumerate(VECTORS):
+            if {*inputs} & {name for name in source.names if name}:
+                text = source.text.replace("vec4(", f"{self._type(4)}(", 1)
+                lines.append(self._made(f"{prefix}{k}", text))
+                found.append(Source(f"{prefix}{k}", source.names))
+        return lines, found
+
+    def _depth(self) -> list[str]:
+        found = self.program.depth
+        if not isinstance(found, DepthNetwork):
+            return []
+        looked = self._looked(found.texture, "uv", "0.0")
+        lines, sources = self._vectors(found.inputs, "dq")
+        sources = [*sources_of(found.texture), *sources]
+        some, raw = self._layers("d", found.layers, found.inputs, sources)
+        depth = self._made("depth", f"{raw[0]} * {literal(found.scale)}", 1)
+        return [*looked, *lines, *some, depth]
+
+    def _features(self) -> list[str]:
+        program, lines = self.program, []
+        for texture in [*program.textures, *([program.scaling] if program.scaling else [])]:
+            moves = []
+            if program.depth is not None and texture.view:
+                moves.append(f"{literal(texture.view)} * btfkit_step(view)")
+            if program.depth is not None and texture.light:
+                moves.append(f"{literal(-texture.light)} * btfkit_step(light)")
+            place = f"uv + depth * ({' + '.join(moves)})" if moves else "uv"
+            lines += self._looked(texture, place, "level")
+        return lines
+
+    def _answer(self) -> list[str]:
+        program = self.program
+        lines, sources = self._vectors(program.inputs, "q")
+        first = [s for texture in program.textures for s in sources_of(texture)]
+        sources = first + sources
+        for f in range(program.frames):
+            names = [program.textures[0].features[3 * f + k] for k in range(3)]
+            axis = f"{self._type(3)}({', '.join(component(name, first) for name in names)})"
+            value = f"{self._type(4)}(dot({axis}, halfway), dot({axis}, light), 0.0, 0.0)"
+            lines.append(self._made(f"frame{f}", value))
+            sources.append(Source(f"frame{f}", (f"frame.{f}.half", f"frame.{f}.light", "", "")))
+        some, raw = self._layers("h", program.layers, program.inputs, sources)
+        heads: dict[str, list[str]] = {}
+        for head in program.heads:
+            heads[head.kind], raw = raw[: head.count], raw[head.count :]
+        lines += some
+        values = reflectance(program, heads)
+        if "opacity" in heads:
+            lines.append(f"opacity = btfkit_sigmoid({heads['opacity'][0]});")
+            values = [f"select({x}, 0.0, !(opacity > 0.0))" if self.language == "wgsl"
+                      else f"opacity > 0.0 ? {x} : 0.0" for x in values]  # fmt: skip
+        return lines + [f"value[{k}] = {x};" for k, x in enumerate(values)]
+
+    def _layers(
+        self, name: str, layers: Sequence[Dense], inputs: Sequence[str], sources: Sequence[Source]
+    ) -> tuple[list[str], list[str]]:
+        """Statements that take inputs through layers, and the scalars of the last in order."""
+        if not layers:
+            return [], [component(input_, sources) for input_ in inputs]
+        if layers[0].residual:
+            raise TypeError("a first layer that adds its inputs has no form in a shader here")
+        used = [source for source in sources if any(n in inputs for n in source.names)]
+        found = [self._array(f"{name}0", len(used), [source.text for source in used])]
+        matrix, width = arranged(layers[0].weight, inputs, used), len(used)
+        for k, layer in enumerate(layers):
+            if k:
+                matrix = padded(layer.weight, 4 * width)
+            cut = self.program.rounded and k + 1 < len(layers)
+            found += self._layer(f"{name}{k}", f"{name}{k + 1}", layer, matrix, rounded=cut)
+            width = len(matrix) // 4
+        n, last = len(layers[-1].bias), f"{name}{len(layers)}"
+        return found, [f"{last}[{k // 4}].{'xyzw'[k % 4]}" for k in range(n)]
+
+    def _layer(self, x: str, y: str, layer: Dense, matrix: Array, *, rounded: bool) -> list[str]:
+        groups, width = len(matrix) // 4, matrix.shape[1] // 4
+        blocks = matrix.reshape(groups, 4, width, 4).transpose(0, 2, 3, 1)
+        at, bias = self.weights.place(blocks), self.weights.place(grouped(layer.bias))
+        kind = "let" if self.language == "wgsl" else "int"
+        sums = [f"{kind} k = {at} + (o * {width} + i) * 4;"]
+        for c, axis in enumerate("xyzw"):
+            sums.append(f"z += btfkit_weights[k + {c}] * {x}[i].{axis};")
+        lines = [self._made("z", f"btfkit_weights[{bias} + o]"), *self._loop("i", width, sums)]
+        value = _activated(layer, "z", f"{x}[o]", rounded=rounded)
+        plain = layer.gain is None or layer.centre is None
+        lines.append(f"{y}[o] = {value if plain else 'z'};")
+        found = [self._array(y, groups), *self._loop("o", groups, lines)]
+        if layer.gain is None or layer.centre is None:
+            return found
+        # Sums of rows beyond the last output are 0; `mask` keeps them so.
+        n, own = literal(len(layer.bias)), f"{y}_"
+        mask, gain, centre = (
+            self.weights.place(grouped(part))
+            for part in (np.ones(len(layer.bias)), layer.gain, layer.centre)
+        )
+        one = self._vec4([1] * 4)
+        found += [self._made(f"{own}mean", "0.0", 1), self._made(f"{own}square", "0.0", 1)]
+        found += self._loop("o", groups, [f"{own}mean += dot({y}[o], {one}) / {n};"])
+        centred = f"{y}[o] = ({y}[o] - {own}mean * {one}) * btfkit_weights[{mask} + o];"
+        found += self._loop("o", groups, [centred, f"{own}square += dot({y}[o], {y}[o]) / {n};"])
+        scale = f"1.0 / sqrt({own}square + {literal(EPSILON)})"
+        found.append(self._made(f"{own}scale", scale, 1))
+        normal = f"{y}[o] * {own}scale * btfkit_weights[{gain} + o] + btfkit_weights[{centre} + o]"
+        last = _activated(layer, "z", f"{x}[o]", rounded=rounded)
+        return found + self._loop("o", groups, [self._made("z", normal), f"{y}[o] = {last};"])
+
+
+def _activated(layer: Dense, z: str, before: str, *, rounded: bool) -> str:
+    value = z if layer.omega == 1 else f"{literal(layer.omega)} * {z}"
+    if layer.activation != "linear":
+        value = f"btfkit_{layer.activation}({value})"
+    value = f"btfkit_rounded({value})" if rounded else value
+    return f"{before} + {value}" if layer.residual else value
+
+
+def _textures(program: Program) -> list[Texture]:
+    depth = [program.depth.texture] if isinstance(program.depth, DepthNetwork) else []
+    return [*depth, *program.textures, *([program.scaling] if program.scaling else [])]
+
+
+def _chosen(program: Program, *, half: bool) -> tuple[list[str], list[str]]:
+    """Sections before the functions of textures, and after them, that the program needs."""
+    depth, inputs = program.depth, {*program.inputs}
+    every = [*program.layers]
+    if isinstance(depth, DepthNetwork):
+        inputs |= {*depth.inputs}
+        every += depth.layers
+    marched, disc = isinstance(depth, Heights), any(n.endswith("_disc") for n in inputs)
+    kinds = {head.kind for head in program.heads}
+    first = ["cell_wrap" if program.wrap else "cell_clamp"]
+    first += ["texel_half" if half else "texel", "lookup"] + ["march"] * marched
+    first += ["rounded"] * program.rounded + ["sigmoid"] * bool(kinds & {"mask", "opacity"})
+    first += [a for a in ("relu", "leaky", "sine") if any(x.activation == a for x in every)]
+    first += ["disc"] * disc + ["step"] * (depth is not None)
+    half_ = program.frames > 0 or inputs & {"hx", "hy", "hz", "cos_diff"}
+    last = ["evaluate", "level" if program.leveled else "no_level"] + ["half"] * bool(half_)
+    return first, last + ["march_depth"] * marched
+
+
+def _values(program: Program, model: str) -> dict[str, object]:
+    found: dict[str, object] = {
+        "model": model, "channels": len(program.channels), "aspect": literal(program.aspect),
+        "lowest": literal(LOWEST_COSINE), "steepest": literal(STEEPEST), "looks": LOOKS,
+        "leak": literal(LEAK), "lit": "true" if program.full_sphere else "light.z > 0.0",
+        "reduced": "uv_in - floor(uv_in)" if program.wrap else "saturate(uv_in)",
+    }  # fmt: skip
+    if isinstance(program.depth, Heights):
+        heights = program.depth.heights
+        found |= {
+            "h": heights.shape[0], "w": heights.shape[1], "top": literal(heights.max()),
+            "rise": literal(heights.max() - heights.min()), "scale": literal(program.depth.scale),
+        }  # fmt: skip
+    return found

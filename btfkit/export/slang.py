@@ -1,0 +1,23 @@
+"""`slang`: one function in Slang over structured buffers, and an entry point that uses it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from btfkit.export.sections import filled, sections
+from btfkit.export.shading import shaded
+from btfkit.materials.base import Material
+from btfkit.program import Program
+
+
+def write(material: Material, program: Program, folder: Path) -> None:
+    """`material.slang`, a file for each buffer, `example.slang` and `compile.py`."""
+    made = shaded(program, "slang", model=material.model)
+    (folder / "material.slang").write_text(made.text)
+    for name, data in made.buffers.items():
+        (folder / f"{name}.bin").write_bytes(data)
+    parts, c, n = sections("material.slang.txt"), len(program.channels), len(made.buffers)
+    entry = filled(parts["compute"], queries=n, answers=n + 1, row=c + 1, channels=c)
+    (folder / "example.slang").write_text(entry)
+    example = filled(parts["compile.py"], buffers=", ".join(made.buffers))
+    (folder / "compile.py").write_text(example)
