@@ -1,4 +1,7 @@
-"""A tree of boxes over triangles, built and walked level by level in whole arrays."""
+"""A tree of boxes over triangles, built and walked level by level in whole arrays.
+
+The plain twin of `embree.Embree`.
+"""
 
 from __future__ import annotations
 

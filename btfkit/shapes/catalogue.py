@@ -8,7 +8,7 @@ from btfkit.errors import unknown
 from btfkit.shapes.closed import Cylinder, Plane, Shape, Sphere
 from btfkit.shapes.torus import Torus
 
-SHAPES = ("plane", "sphere", "cylinder", "torus", "FILE.obj")
+SHAPES = ("plane", "sphere", "cylinder", "torus", "FILE.obj|ply")
 
 
 def shape_of(name: str, *, repeat: int = 1, aspect: float = 1.0, picture: float = 1.0) -> Shape:
@@ -24,10 +24,11 @@ def shape_of(name: str, *, repeat: int = 1, aspect: float = 1.0, picture: float 
         ValueError: no such shape.
         FormatError: a mesh that cannot be read, or that has no texture coordinates.
     """
-    if name.lower().endswith(".obj"):
+    if name.lower().endswith((".obj", ".ply")):
+        from btfkit.shapes import obj, ply
         from btfkit.shapes.mesh import Mesh
-        from btfkit.shapes.obj import read
 
+        read = obj.read if name.lower().endswith(".obj") else ply.read
         return Mesh(read(Path(name)), repeat=repeat, aspect=aspect)
     if name == "plane":
         return Plane(repeat=repeat, aspect=aspect, picture=picture)

@@ -35,7 +35,7 @@ def rendered(source: Path, shape: str) -> np.ndarray:
     """(h, w, c) what the command line draws."""
     out = source.parent / "seen.exr"
     name = shape
-    if shape == "FILE.obj":
+    if shape == "FILE.obj|ply":
         (source.parent / "square.obj").write_text(SQUARE)
         name = str(source.parent / "square.obj")
     arguments = ["render", str(source), "-o", str(out), "--shape", name, "--size", "12x10"]

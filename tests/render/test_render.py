@@ -383,9 +383,12 @@ def test_the_curvature_of_a_mesh_is_that_of_its_normals(tmp_path: Path) -> None:
     np.testing.assert_allclose(flat.all_asked("curvature"), 0, atol=1e-9)
 
 
-def test_triangles_are_found_as_by_trying_all() -> None:
-    from btfkit.shapes.bvh import Bvh
+@pytest.mark.parametrize("kind", ["plain", "embree"])
+def test_triangles_are_found_as_by_trying_all(kind: str) -> None:
+    from btfkit.shapes import bvh, embree
 
+    if kind == "embree" and not embree.available():
+        pytest.skip("there is no wheel of Embree for this machine")
     rng = np.random.default_rng(5)
     corner = rng.uniform(-1, 1, (300, 1, 3)) + rng.normal(scale=0.2, size=(300, 3, 3))
     direction = rng.normal(size=(500, 3))
@@ -400,9 +403,35 @@ def test_triangles_are_found_as_by_trying_all() -> None:
         u, v, t = np.linalg.solve(columns, (origin[row] - corner[:, 0])[..., None])[..., 0].T
         found = t[(u >= 0) & (v >= 0) & (u + v <= 1) & (t > beyond[row])]
         expected[row] = found.min(initial=np.inf)
-    distance, _ = Bvh(corner).meet(origin, direction, beyond)
+    # Embree takes meshes within the unit sphere.
+    scale = np.linalg.norm(corner, axis=2).max()
+    tree = bvh.Bvh(corner) if kind == "plain" else embree.Embree(corner / scale)
+    at = 1 if kind == "plain" else scale
+    distance = tree.meet(origin / at, direction, beyond / at)[0] * at
     assert np.isfinite(expected).sum() > 100
+    # Which triangle is found in float32, where in float64.
     np.testing.assert_allclose(distance, expected, atol=1e-9)
+
+
+def test_embree_passes_every_sheet_once_and_leaves_where_it_begins() -> None:
+    from btfkit.shapes import embree
+
+    if not embree.available():
+        pytest.skip("there is no wheel of Embree for this machine")
+    heights = np.linspace(-0.5, 0.5, 9)
+    square = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    sheets = np.stack([np.c_[square[[0, a, b]], np.full(3, z)]
+                       for z in heights for a, b in ((1, 2), (2, 3))])  # fmt: skip
+    tree = embree.Embree(sheets)
+    # Along the edge that two triangles share, and beside it.
+    origin = np.array([[0.1, 0.1, -30.0], [0.3, -0.2, -30.0], [0.0, 0.0, -30.0]])
+    direction = np.broadcast_to([0.0, 0.0, 1.0], origin.shape)
+    beyond = np.full(3, -np.inf)
+    for z in heights:
+        distance, _ = tree.meet(origin, direction, beyond)
+        np.testing.assert_allclose(distance, z + 30, atol=1e-12)
+        beyond = distance + 1e-6
+    assert not np.isfinite(tree.meet(origin, direction, beyond)[0]).any()
 
 
 def test_rays_meet_a_torus_where_its_quartic_is_zero() -> None:
@@ -730,7 +759,9 @@ def test_noise_for_an_obj_is_a_format_error(tmp_path_factory: Any, noise: bytes)
 def test_triangles_without_texture_area_still_have_a_frame(tmp_path: Path) -> None:
     path = tmp_path / "flat.obj"
     path.write_text(TRIANGLE.replace("vt 1 0", "vt 0 0") + "f 1/1 2/1 3/1\n")
-    seen = pictured(Painted(white()), shape_of(str(path)), size=(16, 16))
+    with pytest.warns(UserWarning, match="lie on a point or a line: each shows one texel"):
+        shape = shape_of(str(path))
+    seen = pictured(Painted(white()), shape, size=(16, 16))
     assert np.isfinite(seen.radiance).all()
     np.testing.assert_allclose(seen.radiance[seen.cover == 1], 1, atol=1e-6)
 
