@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from btfkit.cli.bar import Bar
+from btfkit.cli.many import cluster_option, over, several
 from btfkit.cli.options import DurationType, SettingType, out_option, seed_option
-from btfkit.cli.outcome import Outcome, verb
+from btfkit.cli.outcome import FAILED, Outcome, verb
+
+if TYPE_CHECKING:
+    from btfkit.bench.run import Profile
 
 
 @verb(
@@ -31,6 +36,7 @@ btfkit bench wool.btf.zarr --questions && btfkit bench wool.btf.zarr --answers o
     "--answers", "answers", type=SettingType(), multiple=True, metavar="NAME=FILE.npz",
     help="Score a method from elsewhere: answered questions, rgb added; repeatable.",
 )  # fmt: skip
+@cluster_option
 @click.option("--questions", is_flag=True, help="Write what such a method is asked; fit nothing.")
 @seed_option
 def bench_verb(
@@ -44,6 +50,7 @@ def bench_verb(
     directions: int | None,
     quick: bool,
     answers: tuple[tuple[str, str], ...],
+    cluster: str | None,
     questions: bool,
     seed: int,
 ) -> Outcome:
@@ -52,7 +59,8 @@ def bench_verb(
     NAMES: materials of `btfkit synth --list`, or stores, query files and whatever else `ingest`
     reads. Writes bench.json, tables (bench.md, bench.csv, bench.tex) and two plots of all that
     the folder holds: what former calls finished is kept and told with the rest, so that models,
-    budgets and materials may be run one after the other, or by several processes at a time.
+    budgets and materials may be run one after the other, or by several processes at a time;
+    --cluster gives each material to a worker, names those that fail, and ends in the same tables.
 
     Your own method: --questions writes FOLDER/questions/NAME.npz (uv, light, view); add rgb to each
     and name them with --answers. Without --model nothing is fitted then.
@@ -91,11 +99,54 @@ def bench_verb(
     if questions:
         asked = ask(profile, folder)
         return Outcome("\n".join(map(str, asked)), {"questions": asked})
+    failed: list[dict[str, Any]] = []
+    total = len(profile.sources)
+    if cluster:
+        profile, failed = _on_cluster(cluster, profile, folder.absolute(), bar)
     found = run(profile, folder, progress=bar)
     files = [folder / name for name in FILES]
     line = f"{folder}: {len(found['cells'])} cells\n\n{brief(found['cells'])}"
+    if failed:
+        line += "".join(f"\nfailed {each['source']}: {each['message']}" for each in failed)
+        data = {**found, "files": files, "failed": failed, "error": several(failed, total)}
+        return Outcome(line, data, code=FAILED)
     then = f"open {folder / 'bench.md'}; a method of your own: --questions, then --answers"
     return Outcome(line, {**found, "files": files}, then=then)
+
+
+def _on_cluster(
+    where: str, profile: Profile, folder: Path, bar: Bar
+) -> tuple[Profile, list[dict[str, Any]]]:
+    """Run every material on a worker; returns the profile of those that did not fail."""
+    folder.mkdir(parents=True, exist_ok=True)
+    profile = replace(profile, stores=tuple(path.absolute() for path in profile.stores))
+    tasks = {str(source): (_alone(profile, source), folder) for source in profile.sources}
+    outcome = over(where, tasks, _task, bar)
+    failed: list[dict[str, Any]] = list(outcome.data["failed"])
+    names = {each["source"] for each in failed}
+    return replace(
+        profile,
+        materials=tuple(name for name in profile.materials if name not in names),
+        stores=tuple(path for path in profile.stores if str(path) not in names),
+    ), failed
+
+
+def _alone(profile: Profile, source: str | Path) -> Profile:
+    """The profile of one material, without what is done once for all."""
+    named = isinstance(source, str)
+    return replace(
+        profile,
+        materials=(str(source),) if named else (),
+        stores=() if named else (Path(source),),
+        answers=(),
+        kernel_seconds=0.0,
+    )
+
+
+def _task(source: str, profile: Profile, folder: Path) -> Outcome:
+    from btfkit.bench.run import run
+
+    return Outcome(f"{source}: {len(run(profile, folder)['cells'])} cells")
 
 
 FILES = (
