@@ -63,7 +63,9 @@ def slow_source(folder: Path, count: int) -> Path:
     rng = np.random.default_rng(0)
     for i in range(count):
         codes = rng.integers(0, 255, (500, 500, 3), np.uint8)
-        cv2.imwrite(str(folder / f"tl{i % 8 * 10:03d}_pl{i // 8 * 20:03d}_tv000_pv000.png"), codes)
+        cv2.imwrite(
+            str(folder / f"tl{i % 8 * 10 + 5:03d}_pl{i // 8 * 20:03d}_tv000_pv000.png"), codes
+        )
     return folder
 
 
@@ -139,7 +141,7 @@ def test_a_list_is_ingested_though_one_fails_and_says_the_same_as_alone(
 def test_a_worker_killed_in_the_middle_costs_its_shard_only(
     scheduler: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    source = slow_source(tmp_path / "many", 88)
+    source = slow_source(tmp_path / "many", 64)
     other = sources.SOURCES["ubo2003"](tmp_path)
     out = tmp_path / "out"
     victim = pids(scheduler)[0]
@@ -158,13 +160,13 @@ def test_a_worker_killed_in_the_middle_costs_its_shard_only(
         capsys, "ingest", source, other, "--cluster", scheduler.scheduler_address, "-o", out
     )
     killer.join(10)
-    # 88 textures of 1.5 MB, in shards of 32 MB: four and a rest.
+    # 64 textures of 1.5 MB, in shards of 32 MB: three and a rest.
     assert killed_at
-    assert killed_at[0] < 5
+    assert killed_at[0] < 4
     assert code == 0
     assert len(data["done"]) == 2
     btf, expected = btfkit.open(out / "many.btf.zarr"), btfkit.open(source)
-    for pair in range(0, 88, 8):
+    for pair in range(0, 64, 8):
         np.testing.assert_allclose(btf.texture(pair), expected.texture(pair), rtol=1e-3)
     assert victim not in pids(scheduler)
 
@@ -195,6 +197,8 @@ def test_fits_and_the_benchmark_run_as_lists(
     assert btfkit.load("wool.pca.safetensors").header.grid == (16, 16)
     code, data, _ = call(capsys, "fit", "wool.btf.zarr", "--model", "pca", "--cluster", where)
     assert "exists" in data["failed"][0]["message"]
+    # Tables of kernels are the machine's, not the list's, and take minutes.
+    monkeypatch.setattr("btfkit.bench.run.available", lambda: False)
     code, data, err = call(
         capsys, "bench", "wool.btf.zarr", "felt.btf.zarr", "--model", "lambert", "--cluster", where,
         "-o", "results",

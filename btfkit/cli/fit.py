@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -160,8 +160,7 @@ def _on_cluster(
     from btfkit.files import refuse_existing
     from btfkit.fitting.saving import state_file
 
-    refused: dict[str, Ended] = {}
-    tasks: dict[str, tuple[Path, Mapping[str, Any], bool]] = {}
+    tasks: dict[str, Sequence[Any] | Ended] = {}
     for source, target in targets.items():
         out = Path(str(target))
         state = state_file(out)
@@ -174,10 +173,10 @@ def _on_cluster(
                     f"{state} is there, of an interrupted fit: --resume or --force"
                 )
         except OSError as error:
-            refused[source] = Ended(error=error)
-            continue
-        tasks[source] = (out, asked, preview)
-    return over(where, tasks, _task, bar, refused)
+            tasks[source] = Ended(error=error)
+        else:
+            tasks[source] = (out, asked, preview)
+    return over(where, tasks, _task, bar)
 
 
 def _task(source: str, out: Path, asked: Mapping[str, Any], preview: bool) -> Outcome:

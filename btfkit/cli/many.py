@@ -74,39 +74,37 @@ def outputs(
 
 def over(
     where: str,
-    tasks: Mapping[str, Sequence[Any]],
+    tasks: Mapping[str, Sequence[Any] | Ended],
     function: Callable[..., Outcome],
     bar: Bar,
-    refused: Mapping[str, Ended] | None = None,
 ) -> Outcome:
     """Run `function(source, *arguments)` for every source on a cluster.
 
     Args:
         where: of `--cluster`.
-        tasks: sources with the further arguments of each.
+        tasks: sources with the further arguments of each, or how they ended before they began.
         function: of a module; whatever it writes is whole or absent, and may be there already
             where a worker was lost as it ended.
-        refused: sources that failed before they could be tasks.
     """
-    from btfkit.cluster import connected
+    from btfkit.cluster import Ended, connected
 
-    ended: dict[str, Ended] = dict(refused or {})
-    total = len(tasks) + len(ended)
-    if not tasks:
+    ended = {source: how for source, how in tasks.items() if isinstance(how, Ended)}
+    given = {source: each for source, each in tasks.items() if not isinstance(each, Ended)}
+    if not given:
         return told(ended)
     bar.phase("connecting")
     with connected(where) as cluster:
         bar.phase("working")
-        bar(len(ended), total)
-        for source, arguments in tasks.items():
+        bar(len(ended), len(tasks))
+        for source, arguments in given.items():
 
             def note(how: Ended, source: str = source) -> None:
                 ended[source] = how
-                bar(len(ended), total)
+                bar(len(ended), len(tasks))
 
             cluster.submit(function, source, *arguments, then=note)
         cluster.drain()
-    return told(ended)
+    return told({source: ended[source] for source in tasks})
 
 
 def told(ended: Mapping[str, Ended]) -> Outcome:
