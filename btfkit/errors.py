@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from typing import Any
 
 
 class BtfkitError(Exception):
@@ -27,6 +28,16 @@ class BtfkitError(Exception):
         super().__init__(f"{message}; {remedy}" if remedy else message)
         self.message = message
         self.remedy = remedy
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Exceptions are remade from their line alone, which is not what constructors here take.
+        return _remade, (type(self), str(self)), self.__dict__
+
+
+def _remade(kind: type[BtfkitError], line: str) -> BtfkitError:
+    error = kind.__new__(kind)
+    Exception.__init__(error, line)
+    return error
 
 
 class FormatError(BtfkitError):

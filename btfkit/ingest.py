@@ -16,10 +16,11 @@ from typing import Any, final
 from btfkit import io
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
-from btfkit.files import refuse_existing
 from btfkit.io import listing
 from btfkit.io.store import reader as store
 from btfkit.io.store import writer
+from btfkit.io.store.places import place_of
+from btfkit.remote import Location, Remote, located
 
 # Files up to this size are hashed whole; of larger ones the two ends and the size.
 _HASH_WHOLE = 1 << 30
@@ -47,9 +48,10 @@ class Part:
         return btf.crop(self.rows, self.cols)
 
 
-def store_name(source: str | os.PathLike[str]) -> Path:
+def store_name(source: str | os.PathLike[str] | Remote) -> Path:
     """The store that a source becomes by default: `folder` -> `folder.btf.zarr`, here."""
-    name = Path(source).resolve().name
+    where = located(source)
+    name = where.resolve().name if isinstance(where, Path) else where.name
     for suffix in (".btf.zarr", ".btf", ".zip", ".json", ".csv", ".lp", ".bin", ".binary"):
         if name.lower().endswith(suffix) and len(name) > len(suffix):
             name = name[: -len(suffix)]
@@ -58,8 +60,8 @@ def store_name(source: str | os.PathLike[str]) -> Path:
 
 
 def ingest(
-    source: str | os.PathLike[str],
-    out: str | os.PathLike[str] | None = None,
+    source: str | os.PathLike[str] | Remote,
+    out: str | os.PathLike[str] | Remote | None = None,
     *,
     format: str | None = None,
     options: Mapping[str, Any] | None = None,
@@ -69,12 +71,12 @@ def ingest(
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
     phase: Callable[[str], None] | None = None,
-) -> Path:
+) -> Location:
     """Read a source in any known format and write a native store.
 
     Args:
         source: folder, zip, file or manifest.
-        out: the store; None takes `store_name(source)`.
+        out: the store, a path or a URL that fsspec knows; None takes `store_name(source)`.
         format: a name of `io.FORMATS`; None detects it.
         options: what the format leaves open, as its reader names it; None values are left out.
         part: which part is read.
@@ -83,13 +85,34 @@ def ingest(
             writing (each texture is decoded once and written at once).
 
     Returns:
-        The path of the store.
+        The path, or URL, of the store.
 
     Raises:
         FormatError: damaged or unknown source.
         FileExistsError: `out` exists and `force` is False.
     """
-    final = refuse_existing(out if out is not None else store_name(source), force=force)
+    final = located(out) if out is not None else store_name(source)
+    # Before anything is read; the writer looks again.
+    place_of(final, force=force)
+    record = recorded(source, format=format, options=options, part=part, phase=phase)
+    if phase:
+        phase("reading and writing")
+    writer.write(record, final, dtype=dtype, jobs=jobs, force=force, progress=progress)
+    return checked(final, source, record.shape)
+
+
+def recorded(
+    source: str | os.PathLike[str] | Remote,
+    *,
+    format: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    part: Part | None = None,
+    phase: Callable[[str], None] | None = None,
+) -> BTF:
+    """The BTF of a source with the record of where it came from; no texture is decoded yet.
+
+    Args and errors: as of `ingest`.
+    """
     told = phase or (lambda name: None)
     told("opening")
     name = format or io.detect(source)
@@ -101,39 +124,55 @@ def ingest(
     told("hashing")
     provenance = {
         **btf.provenance,
-        "source": os.fspath(source),
+        "source": str(source),
         "format": name,
-        "hash": source_hash(Path(source)),
+        "hash": source_hash(located(source)),
         "options": {**given, **settled, **_part_record(taken)},
         "versions": {
             "btfkit": importlib.metadata.version("btfkit"),
             "python": platform.python_version(),
         },
     }
-    history = (*btf.history, f"ingested from {name}")
-    record = replace(btf, provenance=provenance, history=history)
-    told("reading and writing")
-    path = writer.write(record, final, dtype=dtype, jobs=jobs, force=force, progress=progress)
-    masked = store.masked_texels(path)
-    n, h, w, _ = btf.shape
+    return replace(btf, provenance=provenance, history=(*btf.history, f"ingested from {name}"))
+
+
+def checked(
+    final: Location, source: str | os.PathLike[str] | Remote, shape: tuple[int, int, int, int]
+) -> Location:
+    """A store that was just written, once it holds a finite texel; warns of masked ones.
+
+    Raises:
+        FormatError: it holds none, and is removed.
+    """
+    masked = store.masked_texels(final)
+    n, h, w, _ = shape
     if masked == n * h * w:
-        shutil.rmtree(path)
-        raise FormatError(source, f"none of {masked} texels is finite", remedy="look at its images")
+        if isinstance(final, Path):
+            shutil.rmtree(final)
+        else:
+            final.remove()
+        raise FormatError(
+            str(source), f"none of {masked} texels is finite", remedy="look at its images"
+        )
     if masked:
         warnings.warn(
-            f"{os.fspath(source)}: {masked} of {n * h * w} texels are not finite; they are masked",
+            f"{source}: {masked} of {n * h * w} texels are not finite; they are masked",
             stacklevel=2,
         )
-    return path
+    return final
 
 
-def source_hash(source: Path) -> dict[str, Any]:
+def source_hash(source: Location) -> dict[str, Any]:
     """SHA-256 that tells a source from another, and what it was taken of.
 
     A file is hashed whole up to 1 GiB, beyond that by its ends and size; a folder by the names and
-    sizes of its files, without hidden ones and stores: the output may grow in it.
+    sizes of its files, without hidden ones and stores: the output may grow in it; a remote store by
+    what its attributes say.
     """
     digest = hashlib.sha256()
+    if isinstance(source, Remote):
+        digest.update(source.read("zarr.json"))
+        return {"sha256": digest.hexdigest(), "of": "attributes"}
     if source.is_dir():
         files = sorted(listing.names_of(source))
         for name in files:

@@ -7,15 +7,19 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
+from btfkit.remote import Remote
+
 
 def plain(value: Any) -> Any:
-    """`value` in JSON's own types: paths as text, arrays as lists, non-finite numbers as text."""
+    """`value` in JSON's own types: paths and URLs as text, arrays as lists, no number as text."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]
     if isinstance(value, os.PathLike):
         return os.fspath(value)
+    if isinstance(value, Remote):
+        return value.url
     # Not by its class: the command line answers --help without numpy.
     if hasattr(value, "tolist"):
         return plain(value.tolist())

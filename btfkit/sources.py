@@ -10,6 +10,7 @@ from btfkit import io
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.io import images
+from btfkit.remote import Location
 
 if TYPE_CHECKING:
     from btfkit.materials.base import Material
@@ -39,7 +40,7 @@ _NAMES: dict[Kind, str] = {
 }
 
 
-def kind_of(path: Path) -> Kind:
+def kind_of(path: Location) -> Kind:
     """What a path is; of a BTF, `io.detect` tells the format.
 
     An EXR is a relief here: where a picture is asked for, it is one too.
@@ -48,6 +49,9 @@ def kind_of(path: Path) -> Kind:
         FileNotFoundError: there is nothing at `path`.
         FormatError: nothing that any reader knows.
     """
+    if not isinstance(path, Path):
+        io.detect(path)
+        return "btf"
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     kind = _BY_SUFFIX.get(path.suffix.lower()) if path.is_file() else None
@@ -57,7 +61,7 @@ def kind_of(path: Path) -> Kind:
     return kind
 
 
-def read(path: Path) -> BTF | QuerySet | Relief | Material:
+def read(path: Location) -> BTF | QuerySet | Relief | Material:
     """What lies at a path; textures are decoded when they are asked for.
 
     Raises:
@@ -66,14 +70,14 @@ def read(path: Path) -> BTF | QuerySet | Relief | Material:
     """
     kind = kind_of(path)
     if kind not in _READERS:
-        raise FormatError(path, f"is {_NAMES[kind]}; expected {_listed(*_READERS)}")
+        raise FormatError(str(path), f"is {_NAMES[kind]}; expected {_listed(*_READERS)}")
     module, function = _READERS[kind].split(":")
     found: BTF | QuerySet | Relief | Material
     found = getattr(importlib.import_module(module), function)(path)
     return found
 
 
-def measured(path: Path) -> BTF | QuerySet | Relief:
+def measured(path: Location) -> BTF | QuerySet | Relief:
     """Whatever a model can be fitted to or tested on.
 
     Raises:
@@ -84,11 +88,11 @@ def measured(path: Path) -> BTF | QuerySet | Relief:
     found = read(path)
     if isinstance(found, Material):
         expected = _listed("btf", "queries", "relief")
-        raise FormatError(path, f"is {_NAMES['model']}; expected {expected}")
+        raise FormatError(str(path), f"is {_NAMES['model']}; expected {expected}")
     return found
 
 
-def material(path: Path, *, curved: bool = False) -> Material:
+def material(path: Location, *, curved: bool = False) -> Material:
     """What answers queries: a model, a BTF interpolated, a relief traced.
 
     Args:
@@ -113,7 +117,7 @@ def material(path: Path, *, curved: bool = False) -> Material:
 
         return TracedRelief(found.under_surface()[0] if curved else found)
     expected = _listed("model", "btf", "relief")
-    raise FormatError(path, f"is {_NAMES['queries']}; expected {expected}")
+    raise FormatError(str(path), f"is {_NAMES['queries']}; expected {expected}")
 
 
 def _listed(*kinds: Kind) -> str:

@@ -26,7 +26,7 @@ from btfkit.cli.outcome import run
 from btfkit.errors import BtfkitError
 from btfkit.ingest import Part, ingest
 from btfkit.io import archive, images
-from btfkit.io.store import reader, writer
+from btfkit.io.store import places, reader, writer
 from btfkit.textures import Textures
 
 READABLE = [name for name in io.FORMATS if name != "axf"]
@@ -215,7 +215,7 @@ def test_a_disk_that_fills_up_in_between_is_one_line_and_nothing_under_the_name(
 ) -> None:
     source = many(tmp_path / "source", 16, 2, 5)
     monkeypatch.setattr(writer, "_SHARD_BYTES", 3 * 16 * 16 * 3 * 2)
-    original, calls = writer.to_disk, Counter[str]()
+    original, calls = places.to_disk, Counter[str]()
 
     def full(path: Path) -> None:
         calls["sync"] += 1
@@ -223,7 +223,7 @@ def test_a_disk_that_fills_up_in_between_is_one_line_and_nothing_under_the_name(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         original(path)
 
-    monkeypatch.setattr(writer, "to_disk", full)
+    monkeypatch.setattr(places, "to_disk", full)
     out = tmp_path / "a.btf.zarr"
     arguments = ["ingest", str(source), "-o", str(out), "--jobs", "1"]
     assert run(command, arguments) == 1
@@ -232,7 +232,7 @@ def test_a_disk_that_fills_up_in_between_is_one_line_and_nothing_under_the_name(
     assert lines[0].startswith("btfkit: error: ")
     assert lines[0].endswith("No space left on device")
     assert not out.exists()
-    monkeypatch.setattr(writer, "to_disk", original)
+    monkeypatch.setattr(places, "to_disk", original)
     decoded: list[str] = []
     read = images.read
     monkeypatch.setattr(

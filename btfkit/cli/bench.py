@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from btfkit.cli.bar import Bar
+from btfkit.cli.many import cluster_option, over, several
 from btfkit.cli.options import DurationType, SettingType, out_option, seed_option
-from btfkit.cli.outcome import Outcome, verb
+from btfkit.cli.outcome import FAILED, Outcome, verb
+
+if TYPE_CHECKING:
+    from btfkit.bench.run import Profile
 
 
 @verb(
@@ -39,6 +44,7 @@ btfkit bench wool.btf.zarr --questions && btfkit bench wool.btf.zarr --answers o
     "--holdout", type=click.FloatRange(0, 1, min_open=True, max_open=True),
     help="Share of pairs, or rows, held out; by default 0.05, with --real 0.1.",
 )  # fmt: skip
+@cluster_option
 @click.option("--questions", is_flag=True, help="Write what such a method is asked; fit nothing.")
 @seed_option
 def bench_verb(
@@ -54,6 +60,7 @@ def bench_verb(
     answers: tuple[tuple[str, str], ...],
     real: Path | None,
     holdout: float | None,
+    cluster: str | None,
     questions: bool,
     seed: int,
 ) -> Outcome:
@@ -62,7 +69,8 @@ def bench_verb(
     NAMES: materials of `btfkit synth --list`, or stores, query files and whatever else `ingest`
     reads. Writes bench.json, tables (bench.md, bench.csv, bench.tex) and two plots of all that
     the folder holds: what former calls finished is kept and told with the rest, so that models,
-    budgets and materials may be run one after the other, or by several processes at a time.
+    budgets and materials may be run one after the other, or by several processes at a time;
+    --cluster gives each material to a worker, names those that fail, and ends in the same tables.
 
     --real DIR: every measured material of a folder. Held-out pairs are alone or in holes, errors
     are told by the angle to the nearest pair trained on and with gains; real.md, with two figures.
@@ -114,15 +122,59 @@ def bench_verb(
     if questions:
         asked = ask(profile, folder)
         return Outcome("\n".join(map(str, asked)), {"questions": asked})
+    failed: list[dict[str, Any]] = []
+    total = len(profile.sources)
+    if cluster:
+        profile, failed = _on_cluster(cluster, profile, folder.absolute(), bar)
     found = run(profile, folder, progress=bar)
     pages = (PAGE, *PICTURES) if real is not None else ()
     files = [folder / name for name in (*FILES, *pages)]
     line = f"{folder}: {len(found['cells'])} cells\n\n{brief(found['cells'])}"
     line += "".join(f"\nnot read: {reason}" for reason in declined.values())
     first = folder / (PAGE if real is not None else "bench.md")
-    then = f"open {first}; a method of your own: --questions, then --answers"
     data = {**found, "files": files} | ({"declined": declined} if real is not None else {})
+    if failed:
+        line += "".join(f"\nfailed {each['source']}: {each['message']}" for each in failed)
+        return Outcome(
+            line, data | {"failed": failed, "error": several(failed, total)}, code=FAILED
+        )
+    then = f"open {first}; a method of your own: --questions, then --answers"
     return Outcome(line, data, then=then)
+
+
+def _on_cluster(
+    where: str, profile: Profile, folder: Path, bar: Bar
+) -> tuple[Profile, list[dict[str, Any]]]:
+    """Run every material on a worker; returns the profile of those that did not fail."""
+    folder.mkdir(parents=True, exist_ok=True)
+    profile = replace(profile, stores=tuple(path.absolute() for path in profile.stores))
+    tasks = {str(source): (_alone(profile, source), folder) for source in profile.sources}
+    outcome = over(where, tasks, _task, bar)
+    failed: list[dict[str, Any]] = list(outcome.data["failed"])
+    names = {each["source"] for each in failed}
+    return replace(
+        profile,
+        materials=tuple(name for name in profile.materials if name not in names),
+        stores=tuple(path for path in profile.stores if str(path) not in names),
+    ), failed
+
+
+def _alone(profile: Profile, source: str | Path) -> Profile:
+    """The profile of one material, without what is done once for all."""
+    named = isinstance(source, str)
+    return replace(
+        profile,
+        materials=(str(source),) if named else (),
+        stores=() if named else (Path(source),),
+        answers=(),
+        kernel_seconds=0.0,
+    )
+
+
+def _task(source: str, profile: Profile, folder: Path) -> Outcome:
+    from btfkit.bench.run import run
+
+    return Outcome(f"{source}: {len(run(profile, folder)['cells'])} cells")
 
 
 FILES = (

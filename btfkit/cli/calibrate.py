@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 
 from btfkit.cli.bar import Bar
+from btfkit.cli.many import cluster_option, over, the_one
 from btfkit.cli.options import force_option, out_option
 from btfkit.cli.outcome import Outcome, verb
 
 
 @verb(
     "calibrate",
-    example="btfkit calibrate run/\nbtfkit calibrate photographs/ --sphere-mm 25 -o coin.lp",
+    example="""btfkit calibrate run/
+btfkit calibrate photographs/ --sphere-mm 25 -o coin.lp
+btfkit calibrate monday/ tuesday/ --cluster local:2""",
 )
-@click.argument("source", metavar="SEQUENCE", type=click.Path(path_type=Path))
+@click.argument(
+    "sources", metavar="SEQUENCE", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
 @out_option("By default SEQUENCE/calibration.json, or NAME.lp in a folder of photographs")
 @click.option(
     "--spheres", type=click.Path(path_type=Path), help="Photographs of the spheres, taken first."
@@ -30,16 +36,50 @@ from btfkit.cli.outcome import Outcome, verb
 @click.option(
     "--transfer", default="srgb", show_default=True, help="Of photographs: srgb, linear or 2.2."
 )
+@cluster_option
 @force_option
 def calibrate_verb(
-    bar: Bar, *, source: Path, out: Path | None, force: bool, **options: Any
+    bar: Bar,
+    *,
+    sources: tuple[Path, ...],
+    out: Path | None,
+    cluster: str | None,
+    force: bool,
+    **options: Any,
 ) -> Outcome:
     """Calibrate a captured sequence, or find the lights of photographs (RTI).
 
     SEQUENCE: a folder with sequence.csv; stages whose frames and settings did not change are not
     run again. A folder of photographs with one or several mirror spheres in view gives their
-    light directions (.lp), and positions where several spheres tell them.
+    light directions (.lp), and positions where several spheres tell them. With --cluster, several,
+    a task each; `btfkit ingest SEQUENCE… --cluster` then rectifies, a task a shard.
     """
+    if not cluster:
+        return _calibrated(the_one(sources, "sequences"), out, force, options, bar)
+    if out and len(sources) > 1:
+        raise click.UsageError("each of several sequences keeps its calibration: leave out -o")
+    given = {n: v.absolute() if isinstance(v, Path) else v for n, v in options.items()}
+    target = out.absolute() if out else None
+    tasks = {str(source.absolute()): (target, force, given) for source in sources}
+    return over(cluster, tasks, _task, bar)
+
+
+def _task(source: str, out: Path | None, force: bool, options: Mapping[str, Any]) -> Outcome:
+    return _calibrated(Path(source), out, force, options, _unheard)
+
+
+def _unheard(done: float, total: float) -> None:
+    """What a worker does is told by the list's progress."""
+
+
+def _calibrated(
+    source: Path,
+    out: Path | None,
+    force: bool,
+    options: Mapping[str, Any],
+    bar: Callable[[float, float], None],
+) -> Outcome:
+    """Calibrate one folder."""
     from btfkit.calibration.calibration import NAME
     from btfkit.calibration.folders import Photographs, calibrate_photographs, calibrate_sequence
     from btfkit.sequence import TABLE

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from btfkit.cli.bar import Bar
+from btfkit.cli.options import LocationType
 from btfkit.cli.outcome import Outcome, verb
+from btfkit.remote import Location
 
 if TYPE_CHECKING:
     from btfkit.btf import BTF
@@ -19,9 +21,9 @@ if TYPE_CHECKING:
 
 @verb("eval", example="btfkit eval wool.neubtf.safetensors wool.btf.zarr --json")
 @click.argument("model", type=click.Path(path_type=Path))
-@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("source", type=LocationType())
 @click.option("--all", "everything", is_flag=True, help="All pairs, those trained on as well.")
-def eval_verb(bar: Bar, *, model: Path, source: Path, everything: bool) -> Outcome:
+def eval_verb(bar: Bar, *, model: Path, source: Location, everything: bool) -> Outcome:
     """Errors of MODEL on SOURCE, a BTF or a query file with answers.
 
     On the data that MODEL was fitted to, only what the fit held out is compared, unless --all

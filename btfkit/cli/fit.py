@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import shlex
 import textwrap
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from btfkit.cli.bar import Bar
+from btfkit.cli.many import cluster_option, outputs, over, the_one
 from btfkit.cli.options import (
     DurationType,
+    LocationType,
     SettingType,
     force_option,
     out_option,
@@ -21,6 +24,7 @@ from btfkit.cli.options import (
 )
 from btfkit.cli.outcome import INTERRUPTED, Outcome, command_line, verb
 from btfkit.cli.preview import of_material, preview_option
+from btfkit.remote import Location, located
 
 if TYPE_CHECKING:
     from btfkit.fitting.report import FitReport
@@ -37,10 +41,15 @@ def _models() -> str:
     return "\n".join(lines)
 
 
-@verb("fit", example="btfkit fit wool.btf.zarr --model neubtf --budget 10m", more=_models)
-@click.argument("source", required=False, type=click.Path(path_type=Path))
+@verb(
+    "fit",
+    example="""btfkit fit wool.btf.zarr --model neubtf --budget 10m
+btfkit fit *.btf.zarr --model neumip --cluster tcp://host:8786 -o models""",
+    more=_models,
+)
+@click.argument("sources", metavar="[SOURCE]", nargs=-1, type=LocationType())
 @click.option("--model", default="auto", show_default=True, help="Name of a model, or auto.")
-@out_option("The model file; by default SOURCE.MODEL.safetensors here")
+@out_option("The model file; by default SOURCE.MODEL.safetensors here; of several, their folder")
 @click.option(
     "--budget",
     type=DurationType(),
@@ -64,13 +73,14 @@ def _models() -> str:
 @click.option(
     "--full-report", is_flag=True, help="Evaluate every held-out pair, beyond the budget."
 )
+@cluster_option
 @preview_option
 @seed_option
 @force_option
 def fit_verb(
     bar: Bar,
     *,
-    source: Path | None,
+    sources: tuple[Location, ...],
     model: str,
     out: Path | None,
     budget: float,
@@ -80,6 +90,7 @@ def fit_verb(
     resume: bool,
     settings: tuple[tuple[str, str], ...],
     full_report: bool,
+    cluster: str | None,
     preview: bool,
     seed: int,
     force: bool,
@@ -88,6 +99,7 @@ def fit_verb(
 
     SOURCE: a native store, anything `btfkit ingest` reads, a relief file or a query file.
     Writes the model and OUT.report.json beside it. Ctrl-C keeps the best state so far.
+    With --cluster, several: a task a material; one that fails is named at the end.
     """
     from btfkit.errors import unknown
     from btfkit.fitting import MODELS
@@ -96,8 +108,19 @@ def fit_verb(
 
     if model != "auto" and model not in MODELS:
         raise ValueError(unknown("model", model, ["auto", *MODELS]))
+    asked: dict[str, Any] = {
+        "model": model, "budget_s": budget, "steps": steps, "holdout": holdout, "seed": seed,
+        "device": device, "settings": dict(settings), "full_report": full_report,
+    }  # fmt: skip
+
+    def named(source: Location) -> Path:
+        return Path(f"{stem(source)}.{model}.safetensors")
+
+    if cluster:
+        targets = outputs(sources, out, named)
+        return _on_cluster(cluster, targets, asked, preview, resume=resume, force=force, bar=bar)
     bar.phase("reading")
-    path = source or the_only(
+    path = the_one(sources, "sources") or the_only(
         Path().glob("*.btf.zarr"),
         what="stores",
         remedy="name one: btfkit fit STORE",
@@ -105,24 +128,67 @@ def fit_verb(
     )
     report = fit(
         measured(path),
-        model=model,
-        budget_s=budget,
-        steps=steps,
-        holdout=holdout,
-        seed=seed,
-        device=device,
-        out=out or Path(f"{stem(path)}.{model}.safetensors"),
+        out=out or named(path),
         resume=resume,
-        settings=dict(settings),
-        full_report=full_report,
         progress=bar,
         phase=bar.phase,
         force=force,
+        **asked,
     )
     if report.interrupted:
         return _to_go_on(report)
+    return _fitted(report, preview)
+
+
+def _fitted(report: FitReport, preview: bool) -> Outcome:
     left = of_material(report.material, Path(report.out)) if preview and report.out else {}
     return Outcome(report.line(), {**report.as_dict(), **left}, then=_next(report))
+
+
+def _on_cluster(
+    where: str,
+    targets: Mapping[str, Location],
+    asked: Mapping[str, Any],
+    preview: bool,
+    *,
+    resume: bool,
+    force: bool,
+    bar: Bar,
+) -> Outcome:
+    """A task a source; a fit whose worker is lost goes on from its last state on another."""
+    from btfkit.cluster import Ended
+    from btfkit.files import refuse_existing
+    from btfkit.fitting.saving import state_file
+
+    tasks: dict[str, Sequence[Any] | Ended] = {}
+    for source, target in targets.items():
+        out = Path(str(target))
+        state = state_file(out)
+        try:
+            refuse_existing(out, force=force or (resume and state.exists()))
+            if force and not resume:
+                state.unlink(missing_ok=True)
+            elif state.exists() and not resume:
+                raise FileExistsError(
+                    f"{state} is there, of an interrupted fit: --resume or --force"
+                )
+        except OSError as error:
+            tasks[source] = Ended(error=error)
+        else:
+            tasks[source] = (out, asked, preview)
+    return over(where, tasks, _task, bar)
+
+
+def _task(source: str, out: Path, asked: Mapping[str, Any], preview: bool) -> Outcome:
+    """Fit a source on a worker; one that another worker began goes on where that left it."""
+    from btfkit.fitting.fit import fit
+    from btfkit.fitting.saving import state_file
+    from btfkit.sources import measured
+
+    begun = state_file(out).is_file()
+    # What lies there is what a lost worker of this very call left.
+    report = fit(measured(located(source)), out=out, resume=begun, force=True, **asked)
+    return _fitted(report, preview)
 
 
 def _to_go_on(report: FitReport) -> Outcome:

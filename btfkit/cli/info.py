@@ -13,8 +13,10 @@ import click
 import numpy as np
 
 from btfkit.cli.bar import Bar
+from btfkit.cli.options import LocationType
 from btfkit.cli.outcome import Outcome, verb
 from btfkit.jsonvalues import plain
+from btfkit.remote import Location
 
 _LIBRARIES = (
     "torch",
@@ -30,8 +32,8 @@ _LIBRARIES = (
 
 
 @verb("info", example="btfkit info wool.btf.zarr")
-@click.argument("path", required=False, type=click.Path(path_type=Path))
-def info_verb(bar: Bar, *, path: Path | None) -> Outcome:
+@click.argument("path", required=False, type=LocationType())
+def info_verb(bar: Bar, *, path: Location | None) -> Outcome:
     """What PATH is: sizes, directions, quantity, colour, provenance, licence.
 
     Without PATH: versions, devices, formats, models and the kernels in use.
@@ -61,14 +63,14 @@ def installation() -> dict[str, Any]:
     }
 
 
-def described(path: Path) -> dict[str, Any]:
+def described(path: Location) -> dict[str, Any]:
     """What a store, a readable source, a model, a relief or a query file says of itself."""
     from btfkit import sources
     from btfkit.btf import BTF
     from btfkit.queries import QuerySet
 
     kind = sources.kind_of(path)
-    if kind == "model":
+    if kind == "model" and isinstance(path, Path):
         from btfkit.materials.file import header_of
 
         return {"kind": kind, "bytes": path.stat().st_size, **header_of(path)}

@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import functools
 import shlex
 from pathlib import Path
+from typing import Any
 
 import click
 
 from btfkit.cli.bar import Bar
-from btfkit.cli.options import SliceType, WindowType, force_option, out_option, seed_option
+from btfkit.cli.many import cluster_option, outputs, the_one, told
+from btfkit.cli.options import (
+    LocationType,
+    SliceType,
+    WindowType,
+    force_option,
+    location_option,
+    seed_option,
+)
 from btfkit.cli.outcome import Outcome, verb
 from btfkit.cli.preview import of_btf, preview_option
+from btfkit.remote import Location
 
 
 @verb(
     "ingest",
-    example="btfkit ingest UBO_WALLPAPER256.zip --lights 0:81:2 -o wallpaper.btf.zarr",
+    example="""btfkit ingest UBO_WALLPAPER256.zip --lights 0:81:2 -o wallpaper.btf.zarr
+btfkit ingest wool/ felt.zip cord.btf --cluster local:2 -o stores""",
 )
-@click.argument("source", type=click.Path(path_type=Path))
-@out_option("The store to write; by default SOURCE.btf.zarr here")
+@click.argument("sources", metavar="SOURCE", nargs=-1, required=True, type=LocationType())
+@location_option("The store to write; by default SOURCE.btf.zarr here; of several, their folder")
 @click.option("--format", "format_name", help="Read as this format instead of detecting it.")
 @click.option("--roi", type=WindowType(), help="Read only this window of rows and columns.")
 @click.option("--views", type=SliceType(), help="Read only these of the distinct views.")
@@ -32,14 +44,16 @@ from btfkit.cli.preview import of_btf, preview_option
 )
 @click.option("--dtype", type=click.Choice(["float16", "float32"]), help="Of the stored textures.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Workers; by default one a processor.")
+@cluster_option
 @preview_option
 @seed_option
 @force_option
 def ingest_verb(
     bar: Bar,
     *,
-    source: Path,
-    out: Path | None,
+    sources: tuple[Location, ...],
+    out: Location | None,
+    cluster: str | None,
     format_name: str | None,
     roi: tuple[slice, slice] | None,
     views: slice | None,
@@ -54,25 +68,49 @@ def ingest_verb(
     """Read any measured source into one native store.
 
     SOURCE: a folder or zip of images named by their angles (UBO2003, ATRIUM, UTIA, spectral),
-    a Bonn .btf, a pose manifest, an RTI .lp, and what else `btfkit info` lists.
+    a Bonn .btf, a pose manifest, an RTI .lp, and what else `btfkit info` lists. With --cluster,
+    several: a task a shard, stores whole or absent, failed sources named at the end.
+
+    -o may be a URL that fsspec reaches (s3://bucket/wool.btf.zarr; extra `remote`).
     """
-    import btfkit
-    from btfkit.ingest import Part, ingest
+    from btfkit.ingest import Part, ingest, store_name
 
     rows, cols = roi or (slice(None), slice(None))
     everything = slice(None)
+    given: dict[str, Any] = {
+        "format": format_name,
+        "options": options,
+        "part": Part(rows, cols, lights or everything, views or everything),
+    }
+    if cluster:
+        from btfkit.cluster import connected
+        from btfkit.shards import Asked, ingest_all
+
+        targets = outputs(sources, out, store_name)
+        for name, value in options.items():
+            options[name] = value.absolute() if isinstance(value, Path) else value
+        closing = functools.partial(_written, preview=preview)
+        bar.phase("connecting")
+        with connected(cluster) as workers:
+            bar.phase("reading and writing")
+            return told(ingest_all(workers, targets, Asked(given, dtype, force, closing), bar))
     path = ingest(
-        source,
+        the_one(sources, "sources"),
         out,
-        format=format_name,
-        options=options,
-        part=Part(rows, cols, lights or everything, views or everything),
         dtype=dtype,
         jobs=jobs,
         force=force,
         progress=bar,
         phase=bar.phase,
+        **given,
     )
+    return _written(path, preview=preview)
+
+
+def _written(path: Location, *, preview: bool) -> Outcome:
+    """What is said of a finished store."""
+    import btfkit
+
     btf = btfkit.open(path)
     n, h, w, c = btf.shape
     return Outcome(
@@ -83,7 +121,7 @@ def ingest_verb(
             "channels": btf.channels,
             "format": btf.provenance["format"],
             "assumed": btf.provenance.get("assumed", {}),
-            **(of_btf(btf, path) if preview else {}),
+            **(of_btf(btf, path) if preview and isinstance(path, Path) else {}),
         },
         then=f"btfkit fit {shlex.quote(str(path))}",
     )

@@ -11,6 +11,7 @@ import click
 
 from btfkit import settings
 from btfkit.errors import BtfkitError
+from btfkit.remote import Location, located
 
 
 @final
@@ -116,9 +117,26 @@ class SettingType(click.ParamType[tuple[str, str]]):
             self.fail(str(error), param, ctx)
 
 
+@final
+class LocationType(click.ParamType[Location]):
+    """A path, or the URL of a store that fsspec reaches."""
+
+    name = "path"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> Location:
+        return located(value)
+
+
 def out_option(what: str) -> Callable[..., Any]:
     """The `-o OUT` option of a verb."""
     return click.option("-o", "--out", type=click.Path(path_type=Path), help=f"{what}.")
+
+
+def location_option(what: str) -> Callable[..., Any]:
+    """The `-o OUT` option of a verb that writes a store, on disk or in an object store."""
+    return click.option("-o", "--out", type=LocationType(), help=f"{what}.")
 
 
 force_option = click.option("--force", is_flag=True, help="Replace an existing output.")
@@ -144,9 +162,9 @@ def the_only(found: Iterable[Path], *, what: str, remedy: str, first: str | None
     raise BtfkitError(f"{what} in this folder: {listing}; expected exactly one", remedy=remedy)
 
 
-def stem(path: Path) -> str:
+def stem(path: Location) -> str:
     """Name of a source without what the toolkit or its format appends."""
-    name = path.resolve().name
-    for suffix in (".btf.zarr", ".safetensors", *path.suffixes[-1:]):
+    name = path.resolve().name if isinstance(path, Path) else path.name
+    for suffix in (".btf.zarr", ".safetensors", *Path(name).suffixes[-1:]):
         name = name.removesuffix(suffix)
     return name

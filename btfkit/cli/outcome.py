@@ -126,7 +126,7 @@ def run(group: click.Group, arguments: Sequence[str]) -> int:
     except Exception as error:  # the last place that can answer for it
         if _was_interrupted(error):
             return _failed("Interrupted", "interrupted; what was finished is kept", INTERRUPTED)
-        return _failed(type(error).__name__, _message(error), FAILED)
+        return _failed(type(error).__name__, error_line(error), FAILED)
     return _manners.code
 
 
@@ -148,16 +148,21 @@ def _was_interrupted(error: BaseException) -> bool:
     return False
 
 
-def _message(error: Exception) -> str:
+def error_line(error: Exception) -> str:
+    """What is wrong, in one line."""
     from btfkit.errors import BtfkitError
 
     if isinstance(error, OSError) and error.strerror and error.filename:
-        return f"{error.filename}: {error.strerror}"
+        return _in_one(f"{error.filename}: {error.strerror}")
     if isinstance(error, (BtfkitError, OSError, ValueError, TypeError, ModuleNotFoundError)):
-        return str(error)
+        return _in_one(str(error))
     if isinstance(error, MemoryError):
-        return f"out of memory ({error})"
-    return f"{type(error).__name__}: {error} (a fault in btfkit; --debug shows where)"
+        return _in_one(f"out of memory ({error})")
+    return _in_one(f"{type(error).__name__}: {error} (a fault in btfkit; --debug shows where)")
+
+
+def _in_one(text: str) -> str:
+    return " ".join(text.split())
 
 
 def _failed(kind: str, message: str, code: int) -> int:
@@ -165,7 +170,7 @@ def _failed(kind: str, message: str, code: int) -> int:
         traceback.print_exc()
     if _manners.as_json:
         _print_json({"error": {"type": kind, "message": message}})
-    print(f"btfkit: error: {' '.join(message.split())}", file=sys.stderr)  # noqa: T201
+    print(f"btfkit: error: {_in_one(message)}", file=sys.stderr)  # noqa: T201
     return code
 
 
@@ -183,6 +188,8 @@ def _say(outcome: Outcome, warned: list[str]) -> None:
         click.echo(outcome.line)
         if outcome.then and not _manners.quiet:
             click.echo(f"next: {outcome.then}", err=True)
+    if "error" in outcome.data:
+        print(f"btfkit: error: {outcome.data['error']['message']}", file=sys.stderr)  # noqa: T201
     _manners.code = outcome.code
 
 

@@ -10,9 +10,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from btfkit.cli.bar import Bar
-from btfkit.cli.options import NumbersType, force_option, out_option, seed_option, stem
+from btfkit.cli.options import (
+    LocationType,
+    NumbersType,
+    force_option,
+    out_option,
+    seed_option,
+    stem,
+)
 from btfkit.cli.outcome import Outcome, verb
 from btfkit.jsonvalues import plain
+from btfkit.remote import Location
 
 if TYPE_CHECKING:
     from btfkit.materials.base import Material
@@ -30,7 +38,7 @@ _IN_MEMORY = 1 << 30
     example="""btfkit render wool.neumip.safetensors -o wool.png --shape sphere --light 40,45
 btfkit render wool.btf.zarr -o wool.exr --shape torus --env hall.hdr --repeat 3""",
 )
-@click.argument("source", metavar="MODEL_OR_BTF", type=click.Path(path_type=Path))
+@click.argument("source", metavar="MODEL_OR_BTF", type=LocationType())
 @out_option("*.png or *.jpg (sRGB), *.exr (linear); by default the source's name with .png, here")
 @click.option("--shape", default="plane", show_default=True,
               help="plane, sphere, cylinder, torus or FILE.obj.")  # fmt: skip
@@ -53,7 +61,7 @@ btfkit render wool.btf.zarr -o wool.exr --shape torus --env hall.hdr --repeat 3"
 def render_verb(
     bar: Bar,
     *,
-    source: Path,
+    source: Location,
     out: Path | None,
     shape: str,
     lights: tuple[tuple[float, float], ...],

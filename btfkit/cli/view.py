@@ -7,16 +7,17 @@ from pathlib import Path
 import click
 
 from btfkit.cli.bar import Bar
-from btfkit.cli.options import force_option, out_option, stem
+from btfkit.cli.options import LocationType, force_option, out_option, stem
 from btfkit.cli.outcome import Outcome, verb
+from btfkit.remote import Location
 
 
 @verb("view", example="btfkit view wool.neumip.safetensors -o wool.html")
-@click.argument("source", metavar="MODEL_OR_BTF", type=click.Path(path_type=Path))
+@click.argument("source", metavar="MODEL_OR_BTF", type=LocationType())
 @out_option("*.html; by default the source's name with .html, here")
 @click.option("--small", is_flag=True, help="Textures of a model in 8 bits: half the bytes.")
 @force_option
-def view_verb(bar: Bar, *, source: Path, out: Path | None, small: bool, force: bool) -> Outcome:
+def view_verb(bar: Bar, *, source: Location, out: Path | None, small: bool, force: bool) -> Outcome:
     """One self-contained page: a model on shapes to turn and light, or a BTF pair by pair.
 
     Nothing is loaded from a network; the page may be mailed, or opened from a disc.
@@ -39,7 +40,7 @@ def view_verb(bar: Bar, *, source: Path, out: Path | None, small: bool, force: b
     elif isinstance(found, BTF):
         kind, text = "btf", store.page(found, title=title, progress=bar)
     else:
-        raise FormatError(source, "has no page; expected a fitted model or a BTF")
+        raise FormatError(str(source), "has no page; expected a fitted model or a BTF")
     with whole(final, force=force) as partial:
         partial.write_text(text, encoding="utf-8")
     size = final.stat().st_size

@@ -15,6 +15,7 @@ from typing import Any
 
 from btfkit.btf import BTF
 from btfkit.errors import FormatError, unknown
+from btfkit.remote import Remote, located
 
 # The order is the order of detection: the more specific first.
 FORMATS: dict[str, str] = {
@@ -41,14 +42,16 @@ def format_module(name: str) -> ModuleType:
     return importlib.import_module(FORMATS[name])
 
 
-def detect(path: str | os.PathLike[str]) -> str:
+def detect(path: str | os.PathLike[str] | Remote) -> str:
     """Name of the format that a path looks like.
 
     Raises:
         FileNotFoundError: there is nothing at `path`.
         FormatError: no reader knows it; the message lists the formats.
     """
-    source = Path(path)
+    source = located(path)
+    if isinstance(source, Remote):
+        return _remote(source)
     if not source.exists():
         raise FileNotFoundError(f"{source}: no such file or folder")
     if not (source.is_dir() or source.is_file()):
@@ -70,6 +73,20 @@ def detect(path: str | os.PathLike[str]) -> str:
         what += f"; {away[0]} is a link that leaves the folder, and is not followed"
         remedy = f"put what it leads to in its place, or name that itself; {remedy}"
     raise FormatError(source, what, remedy=remedy)
+
+
+def _remote(source: Remote) -> str:
+    """The one format that is read from an object store."""
+    if not source.exists("zarr.json"):
+        raise FileNotFoundError(f"{source}: there is no Zarr group")
+    from btfkit.io.store.reader import is_store
+
+    if not is_store(source):
+        raise FormatError(
+            str(source), "no store of btfkit, or one that is not finished",
+            remedy="other formats are read from disk: fetch it first",
+        )  # fmt: skip
+    return "zarr"
 
 
 def _links_away(source: Path) -> list[str]:
@@ -96,11 +113,13 @@ def options_of(name: str) -> tuple[str, ...]:
     return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
 
 
-def open(path: str | os.PathLike[str], *, format: str | None = None, **options: Any) -> BTF:
+def open(
+    path: str | os.PathLike[str] | Remote, *, format: str | None = None, **options: Any
+) -> BTF:
     """A BTF from anything readable; textures are decoded when they are asked for.
 
     Args:
-        path: store, folder, zip, manifest or file.
+        path: store, folder, zip, manifest or file; or the URL of a store (s3://...).
         format: a name of `FORMATS`, where detection should not decide.
         **options: what the format leaves open, as its reader names them.
 
@@ -109,12 +128,15 @@ def open(path: str | os.PathLike[str], *, format: str | None = None, **options: 
         FormatError: damaged, or no reader knows it.
         ValueError: an option that the format does not have.
     """
-    name = format or detect(path)
+    where = located(path)
+    name = detect(where) if isinstance(where, Remote) or not format else format
+    if format and name != format:
+        raise ValueError(f"{where} is read as a native store alone, not as {format}")
     module = format_module(name)
     given = {key: value for key, value in options.items() if value is not None}
     unknown = sorted(given.keys() - set(options_of(name)))
     if unknown:
         known = ", ".join(options_of(name)) or "none"
         raise ValueError(f"format {name} has no option {', '.join(unknown)}; it has {known}")
-    btf: BTF = module.read(Path(path), **given)
+    btf: BTF = module.read(where, **given)
     return btf

@@ -187,7 +187,7 @@ def test_a_killed_write_leaves_no_store_and_is_resumed(tmp_path: Path) -> None:
 
 
 def _texture_shard(path: Path) -> Path:
-    return reader.shard_path(path / "texture", 0)
+    return path / reader.shard_name("texture", 0)
 
 
 def test_a_damaged_chunk_is_an_error_that_names_it(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from btfkit import native
 from btfkit.btf import BTF, QUANTITY
 from btfkit.errors import FormatError
 from btfkit.io.store.chunks import Chunks, are_ours
+from btfkit.remote import Location, Remote
 from btfkit.textures import Array, Index, Textures
 
 VERSION = 1
@@ -30,6 +31,9 @@ IMAGE_AXES = ("pair", "row", "column", "channel")
 _MOST_VALUES, _MOST_PAIRS = 1 << 31, 1 << 24
 # Memory for rows of all textures, which ABRDFs are taken from.
 _BAND_BYTES = 64 << 20
+# The attribute that makes a group a store of ours: its version.
+MARK = "btfkit"
+_MARKED = f'"{MARK}"'.encode()
 _AGAIN = "ingest the source again, or copy the store again"
 
 
@@ -39,25 +43,40 @@ def detect(path: Path) -> bool:
     if not metadata.is_file():
         return False
     with metadata.open("rb") as file:
-        return b'"btfkit"' in file.read(1 << 20)
+        return _MARKED in file.read(1 << 20)
 
 
-def read(path: Path) -> BTF:
+def is_store(where: Remote) -> bool:
+    """The same of a remote folder.
+
+    Raises:
+        OSError: it cannot be reached.
+    """
+    return where.exists("zarr.json") and _MARKED in where.read("zarr.json")
+
+
+def read(path: Location) -> BTF:
     """The BTF in a native store; textures are decoded when they are asked for.
 
     Raises:
         FormatError: not a store, of a newer version, incomplete or damaged.
     """
     try:
-        group = zarr.open_group(path, mode="r", zarr_format=3)
+        group = open_group(path)
         attributes: dict[str, Any] = dict(group.attrs)
-        version = attributes.get("btfkit")
+        version = attributes.get(MARK)
     except Exception as error:  # zarr raises whatever its parsers raise
-        raise FormatError(path, f"not a readable Zarr group ({error})", remedy=_AGAIN) from error
+        raise FormatError(
+            str(path), f"not a readable Zarr group ({error})", remedy=_AGAIN
+        ) from error
     if not isinstance(version, int) or not 1 <= version <= VERSION:
-        raise FormatError(path, f"store version {version!r}; this version reads up to {VERSION}")
+        raise FormatError(
+            str(path), f"store version {version!r}; this version reads up to {VERSION}"
+        )
     if attributes.get("quantity") != QUANTITY:
-        raise FormatError(path, f"quantity {attributes.get('quantity')!r}; expected {QUANTITY!r}")
+        raise FormatError(
+            str(path), f"quantity {attributes.get('quantity')!r}; expected {QUANTITY!r}"
+        )
     textures = StoreTextures(path, _member(path, group, "texture"))
     n, h, w, _ = textures.shape
 
@@ -81,12 +100,22 @@ def read(path: Path) -> BTF:
             **_said(attributes),
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise FormatError(path, f"the store contradicts itself: {error}", remedy=_AGAIN) from error
+        raise FormatError(
+            str(path), f"the store contradicts itself: {error}", remedy=_AGAIN
+        ) from error
 
 
-def masked_texels(path: Path) -> int:
+def open_group(path: Location) -> zarr.Group:
+    """The Zarr group of a store, for reading."""
+    if isinstance(path, Path):
+        return zarr.open_group(path, mode="r", zarr_format=3)
+    with path.told():
+        return zarr.open_group(path.url, mode="r", zarr_format=3)
+
+
+def masked_texels(path: Location) -> int:
     """How many texels of a store hold a value that is not finite."""
-    masked = zarr.open_group(path, mode="r", zarr_format=3).attrs.get("masked_texels", 0)
+    masked = open_group(path).attrs.get("masked_texels", 0)
     return masked if isinstance(masked, int) else 0
 
 
@@ -94,7 +123,7 @@ def masked_texels(path: Path) -> int:
 class StoreTextures(Textures):
     """The textures of a native store: one chunk is read for one texture."""
 
-    def __init__(self, path: Path, array: zarr.Array[Any]) -> None:
+    def __init__(self, path: Location, array: zarr.Array[Any]) -> None:
         shape = array.shape
         if (
             len(shape) != 4
@@ -102,10 +131,10 @@ class StoreTextures(Textures):
             or int(np.prod(shape[1:], dtype=object)) > _MOST_VALUES
             or shape[0] > _MOST_PAIRS
         ):
-            raise FormatError(path, f"{array.basename} has shape {shape}", remedy=_AGAIN)
+            raise FormatError(str(path), f"{array.basename} has shape {shape}", remedy=_AGAIN)
         if array.dtype not in (np.float16, np.float32) or array.chunks != (1, *shape[1:]):
             raise FormatError(
-                path,
+                str(path),
                 f"{array.basename} is {array.dtype} in chunks {array.chunks}; "
                 f"expected float16 or float32, one chunk a texture",
             )
@@ -113,19 +142,31 @@ class StoreTextures(Textures):
         self.dtype = array.dtype
         self._path, self._array = path, array
         self._run = (array.shards or array.chunks)[0]
-        self._chunks = Chunks(array, self._shard) if are_ours(array) else None
+        local = isinstance(path, Path)
+        self._chunks = Chunks(array, self._shard) if local and are_ours(array) else None
+        self._there: frozenset[str] | None = None
         self._band: tuple[int, Array] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         # Another process keeps a band of its own.
         return {**self.__dict__, "_band": None}
 
-    def _shard(self, shard: int) -> Path:
-        return shard_path(self._path / self._array.basename, shard)
+    def _shard(self, shard: int) -> str:
+        return f"{self._path}/{shard_name(self._array.basename, shard)}"
+
+    def _has(self, shard: int) -> bool:
+        if isinstance(self._path, Path):
+            return Path(self._shard(shard)).is_file()
+        if self._there is None:
+            # Listed once: whole stores do not change.
+            folder = f"{self._array.basename}/c"
+            self._there = frozenset(f"{folder}/{name}" for name in self._path.names(folder))
+        return shard_name(self._array.basename, shard) in self._there
 
     def _read(self, index: int) -> Array:
-        shard = self._shard(index // self._run)
-        if not shard.is_file():
+        number = index // self._run
+        shard = self._shard(number)
+        if not self._has(number):
             # Zarr answers a missing shard with the fill value, silently.
             raise FormatError(shard, f"missing; it holds pair {index}", remedy=_AGAIN)
         try:
@@ -162,24 +203,24 @@ class StoreTextures(Textures):
         return band
 
 
-def shard_path(array: Path, shard: int) -> Path:
-    """File of a shard of an image array: Zarr's default chunk key encoding."""
-    return array / "c" / str(shard) / "0" / "0" / "0"
+def shard_name(array: str, shard: int) -> str:
+    """A shard of an image array inside its store: Zarr's default chunk key encoding."""
+    return f"{array}/c/{shard}/0/0/0"
 
 
-def _required(path: Path, array: NDArray[Any] | None, name: str) -> NDArray[Any]:
+def _required(path: Location, array: NDArray[Any] | None, name: str) -> NDArray[Any]:
     if array is None:
-        raise FormatError(path, f"the store has no array {name!r}", remedy=_AGAIN)
+        raise FormatError(str(path), f"the store has no array {name!r}", remedy=_AGAIN)
     return array
 
 
-def _member(path: Path, group: zarr.Group, name: str) -> zarr.Array[Any]:
+def _member(path: Location, group: zarr.Group, name: str) -> zarr.Array[Any]:
     try:
         member = group[name]
     except Exception as error:
-        raise FormatError(path, f"array {name!r} is missing or damaged ({error})") from error
+        raise FormatError(str(path), f"array {name!r} is missing or damaged ({error})") from error
     if not isinstance(member, zarr.Array):
-        raise FormatError(path, f"{name!r} is a group; expected an array")
+        raise FormatError(str(path), f"{name!r} is a group; expected an array")
     return member
 
 
@@ -212,24 +253,24 @@ def _said(attributes: dict[str, Any]) -> dict[str, Any]:
 
 
 def _whole(
-    path: Path, array: zarr.Array[Any], shapes: tuple[tuple[int, ...], ...], kind: str
+    path: Location, array: zarr.Array[Any], shapes: tuple[tuple[int, ...], ...], kind: str
 ) -> NDArray[Any]:
     """All of a small array of one of the given shapes."""
     if array.shape not in shapes or array.dtype.kind != kind:
         raise FormatError(
-            path, f"{array.basename} is {array.dtype} of shape {array.shape}", remedy=_AGAIN
+            str(path), f"{array.basename} is {array.dtype} of shape {array.shape}", remedy=_AGAIN
         )
     try:
         # Zarr answers a missing chunk with the fill value, silently.
         lacking = array.nchunks - array.nchunks_initialized
         if lacking > 0:
             raise FormatError(
-                path, f"{lacking} chunks of {array.basename!r} are missing", remedy=_AGAIN
+                str(path), f"{lacking} chunks of {array.basename!r} are missing", remedy=_AGAIN
             )
         return np.asarray(array[...])
     except FormatError:
         raise
     except Exception as error:  # whatever the codecs raise on damaged bytes
         raise FormatError(
-            path, f"array {array.basename!r} is damaged ({error})", remedy=_AGAIN
+            str(path), f"array {array.basename!r} is damaged ({error})", remedy=_AGAIN
         ) from error

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -24,9 +22,9 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from btfkit import native
 from btfkit.btf import BTF, QUANTITY
 from btfkit.errors import BtfkitError
-from btfkit.files import named, refuse_existing, replace_folder
-from btfkit.io.store.reader import IMAGE_AXES, VERSION, shard_path
-from btfkit.journal import Journal, alone, partial_folder, to_disk
+from btfkit.io.store.places import Place, place_of
+from btfkit.io.store.reader import IMAGE_AXES, MARK, VERSION
+from btfkit.remote import Location, Remote, located
 from btfkit.textures import HALF_RANGE, Textures, as_textures
 
 # Bytes of textures in one shard: what a worker holds, and what an interruption can lose.
@@ -39,18 +37,18 @@ class HalfRangeError(BtfkitError):
 
 def write(
     btf: BTF,
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Remote,
     *,
     dtype: str | None = None,
     jobs: int | None = None,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
-) -> Path:
+) -> Location:
     """Write `btf` as a native store; an interrupted call goes on where it stopped.
 
     Args:
         btf: what to write; each texture is decoded once, on one of the workers.
-        path: final name, by custom `*.btf.zarr`.
+        path: final name, by custom `*.btf.zarr`; or a URL that fsspec knows (s3://...).
         dtype: "float16" or "float32"; None takes float16, and float32 where a value needs it.
         jobs: workers; None takes one a processor.
         force: whether an existing store is replaced.
@@ -63,27 +61,31 @@ def write(
         FileExistsError: `path` exists and `force` is False.
         BtfkitError: `dtype` is "float16" and a value exceeds 6e4, or another run writes it.
     """
-    final = refuse_existing(path, force=force)
-    with alone(final):
-        if dtype is None and _begun(btf, final, "float32"):
-            # An earlier run found that half does not do.
-            return _write(btf, final, "float32", jobs, progress)
+    place = place_of(path, force=force)
+    with place.alone():
+        chosen = dtype or begun_dtype(btf, place)
         try:
-            return _write(btf, final, dtype or "float16", jobs, progress)
+            _write(btf, place, chosen, jobs, progress)
         except HalfRangeError:
             if dtype is not None:
                 raise
-            return _write(btf, final, "float32", jobs, progress)
+            _write(btf, place, "float32", jobs, progress)
+    return located(path)
+
+
+def begun_dtype(btf: BTF, place: Place) -> str:
+    """The type to try first: half, unless an earlier run found that half does not do."""
+    return "float32" if place.begun(_identity(btf, "float32")) else "float16"
 
 
 def _write(
     btf: BTF,
-    final: Path,
+    place: Place,
     dtype: str,
     jobs: int | None,
     progress: Callable[[int, int], None] | None,
-) -> Path:
-    job = _Job.begin(btf, final, dtype)
+) -> None:
+    job = Job.begin(btf, place, dtype)
     missing = job.missing()
     done = len(btf) - sum(len(run) for run in missing)
     workers = min(jobs or native.threads(), max(len(missing), 1))
@@ -98,20 +100,22 @@ def _write(
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    job.finish(final)
-    return final
+    job.finish()
 
 
-def _finished(
-    pool: ThreadPoolExecutor, job: _Job, runs: list[range], workers: int
-) -> Iterator[int]:
+def _finished(pool: ThreadPoolExecutor, job: Job, runs: list[range], workers: int) -> Iterator[int]:
     """Write the runs, at most one more in flight than there are workers; yield their sizes."""
+
+    def write(run: range) -> int:
+        job.note(run, job.write(run))
+        return len(run)
+
     pending: set[Future[int]] = set()
     for run in runs:
         if len(pending) > workers:
             done, pending = wait(pending, return_when=FIRST_COMPLETED)
             yield from (future.result() for future in done)
-        pending.add(pool.submit(job.write, run))
+        pending.add(pool.submit(write, run))
     while pending:
         done, pending = wait(pending, return_when=FIRST_COMPLETED)
         yield from (future.result() for future in done)
@@ -119,46 +123,51 @@ def _finished(
 
 @final
 @dataclass(frozen=True)
-class _Job:
-    """One store being written: its folder, its arrays and its journal."""
+class Job:
+    """One store being written: its place and its arrays.
 
-    folder: Path
-    journal: Journal
+    Several processes may hold the same job, each writing runs of its own; one of them notes what
+    is finished.
+    """
+
+    place: Place
     btf: BTF
     images: dict[str, tuple[Textures, zarr.Array[Any]]]
     run: int
 
     @staticmethod
-    def begin(btf: BTF, final: Path, dtype: str) -> _Job:
-        """Open the partial folder: the earlier one where it is of the same job, or a new one."""
-        folder = partial_folder(final)
-        journal = Journal(folder)
-        if _begun(btf, final, dtype):
-            journal.go_on()
+    def begin(btf: BTF, place: Place, dtype: str) -> Job:
+        """Go on with the earlier run where it was of the same job, or begin anew."""
+        identity = _identity(btf, dtype)
+        if place.begun(identity):
+            place.go_on()
         else:
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir()
-            _create(folder, btf, dtype)
-            journal.begin(_identity(btf, dtype))
-        group = zarr.open_group(folder, mode="r+", zarr_format=3)
+            place.begin(identity, lambda where: _create(where, btf, dtype))
+        return Job.taken(btf, place, dtype)
+
+    @staticmethod
+    def taken(btf: BTF, place: Place, dtype: str) -> Job:
+        """A job that has begun, here or in another process."""
+        group = place.group()
         images: dict[str, tuple[Textures, zarr.Array[Any]]] = {}
         for name, textures in _images(btf).items():
             array = group[name]
             if isinstance(array, zarr.Array):  # a group by that name cannot be: `_create`
                 # Textures of NaN alone are chunks as well: a missing one is damage.
                 images[name] = (textures, array.with_config({"write_empty_chunks": True}))
-        return _Job(folder, journal, btf, images, _run_length(btf, dtype))
+        return Job(place, btf, images, _run_length(btf, dtype))
 
     def missing(self) -> list[range]:
-        """Runs of pairs that no journal line says are written."""
-        written = {entry["shard"] for entry in self.journal.entries()}
+        """Runs of pairs that no note says are written."""
+        written = {entry["shard"] for entry in self.place.entries()}
         n = len(self.btf)
         runs = [range(start, min(start + self.run, n)) for start in range(0, n, self.run)]
         return [run for shard, run in enumerate(runs) if shard not in written]
 
     def write(self, run: range) -> int:
-        """Decode and write one shard of every image array, then note it."""
+        """Decode and write one shard of every image array; returns how many texels are masked."""
         masked = 0
+        number = run.start // self.run
         for name, (textures, array) in self.images.items():
             block = np.empty((len(run), *textures.shape[1:]), array.dtype)
             for slot, pair in enumerate(run):
@@ -173,22 +182,21 @@ class _Job:
                         remedy="write float32",
                     )
                 block[slot] = np.where(finite, image, np.nan)
-            shard = shard_path(self.folder / name, run.start // self.run)
             try:
                 array[run.start : run.stop] = block
             except OSError as error:
-                raise named(error, shard) from error
-            to_disk(shard)
-        self.journal.note({"shard": run.start // self.run, "masked": masked})
-        return len(run)
+                raise self.place.failed(name, number, error) from error
+            self.place.safe(name, number)
+        return masked
 
-    def finish(self, final: Path) -> None:
-        """Note how many texels are masked, drop the journal and give the store its name."""
-        masked = sum(entry["masked"] for entry in self.journal.entries())
-        zarr.open_group(self.folder, mode="r+", zarr_format=3).attrs["masked_texels"] = masked
-        # The journal goes last: a run killed in between has nothing to do again.
-        replace_folder(self.folder, final)
-        Journal(final).remove()
+    def note(self, run: range, masked: int) -> None:
+        """Note that a run is written."""
+        self.place.note({"shard": run.start // self.run, "masked": masked})
+
+    def finish(self) -> None:
+        """Note how many texels are masked, and give the store its name."""
+        masked = sum(entry["masked"] for entry in self.place.entries())
+        self.place.finish({MARK: VERSION, "masked_texels": masked})
 
 
 def _identity(btf: BTF, dtype: str) -> dict[str, Any]:
@@ -209,11 +217,6 @@ def _digest(*arrays: NDArray[Any] | None) -> str:
     return digest.hexdigest()
 
 
-def _begun(btf: BTF, final: Path, dtype: str) -> bool:
-    """Whether an earlier run has begun the same store."""
-    return Journal(partial_folder(final)).of_job(_identity(btf, dtype))
-
-
 def _images(btf: BTF) -> dict[str, Textures]:
     images = {"texture": btf.textures}
     if btf.variance is not None:
@@ -226,8 +229,8 @@ def _run_length(btf: BTF, dtype: str) -> int:
     return int(np.clip(_SHARD_BYTES // texture, 1, len(btf)))
 
 
-def _create(folder: Path, btf: BTF, dtype: str) -> None:
-    group = zarr.open_group(folder, mode="w", zarr_format=3, attributes=_attributes(btf))
+def _create(where: str, btf: BTF, dtype: str) -> None:
+    group = zarr.open_group(where, mode="w", zarr_format=3, attributes=_attributes(btf))
     texture = btf.shape[1:]
     for name in _images(btf):
         group.create_array(
@@ -280,7 +283,6 @@ def _codecs() -> list[Any]:
 
 def _attributes(btf: BTF) -> dict[str, Any]:
     return {
-        "btfkit": VERSION,
         "quantity": QUANTITY,
         "colour": btf.colour,
         "channels": list(btf.channels),
