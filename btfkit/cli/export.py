@@ -42,7 +42,7 @@ def _next(target: str, out: Path) -> str:
         "glsl": f"open {folder}/example.html in a browser",
         "exr": f"python {folder}/evaluate.py queries.npz answers.npz",
         "wgsl": f"python {folder}/evaluate.py queries.npz answers.npz",
-        "slang": f"python {folder}/compile.py",
+        "slang": f"python {folder}/evaluate.py queries.npz answers.npz",
         "onnx": f"python {folder}/evaluate.py queries.npz answers.npz",
         "three": f"cd {folder} && npm install && python -m http.server, then open it in a browser",
     }[target]

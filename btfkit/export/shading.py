@@ -29,11 +29,13 @@ class Shaded:
     Attributes:
         text: of the function `btfkit_evaluate` and what it calls.
         buffers: bytes by name, in the order of their bindings: `weights` and `heights` float32,
-            `texels` in float16 where that loses nothing, else float32. None is empty.
+            `texels`. None is empty.
+        half: whether texels are float16, which loses nothing then; else they are float32.
     """
 
     text: str
     buffers: dict[str, bytes]
+    half: bool
 
 
 def shaded(program: Program, language: Language, *, model: str) -> Shaded:
@@ -77,7 +79,7 @@ class _Writer:
         text += "".join(self.functions)
         text += filled("".join(parts[name] for name in last), **values)
         text += "".join(f"  {line}\n" for line in body) + parts["end"]
-        return Shaded(text, buffers)
+        return Shaded(text, buffers, self._half)
 
     # What both languages spell in their own way.
 

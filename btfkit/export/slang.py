@@ -11,7 +11,7 @@ from btfkit.program import Program
 
 
 def write(material: Material, program: Program, folder: Path) -> None:
-    """`material.slang`, a file for each buffer, `example.slang` and `compile.py`."""
+    """`material.slang`, a file for each buffer, `example.slang` and `evaluate.py`."""
     made = shaded(program, "slang", model=material.model)
     (folder / "material.slang").write_text(made.text)
     for name, data in made.buffers.items():
@@ -19,5 +19,13 @@ def write(material: Material, program: Program, folder: Path) -> None:
     parts, c, n = sections("material.slang.txt"), len(program.channels), len(made.buffers)
     entry = filled(parts["compute"], queries=n, answers=n + 1, row=c + 1, channels=c)
     (folder / "example.slang").write_text(entry)
-    example = filled(parts["compile.py"], buffers=", ".join(made.buffers))
-    (folder / "compile.py").write_text(example)
+    # Texels of four half floats are two numbers of four bytes.
+    sizes = {"weights": 4, "texels": 2 if made.half else 4, "heights": 1}
+    example = filled(
+        parts["evaluate.py"],
+        model=material.model,
+        channels=c,
+        order=", ".join(made.buffers),
+        buffers=repr({name: sizes[name] for name in made.buffers}),
+    )
+    (folder / "evaluate.py").write_text(example)

@@ -1,4 +1,4 @@
-"""A material in WGSL, run by wgpu on whatever Vulkan there is, answers as the material does."""
+"""A material in WGSL, run by wgpu on whatever Vulkan there is, and in Slang, compiled for the CPU."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import needs
 import numpy as np
 import pytest
 from cases import SPECS, made
-from test_export import agree, asked, wanted
+from test_export import COMPILER, agree, asked, wanted
 
-from btfkit.export import wgsl
+from btfkit.export import slang, wgsl
 from btfkit.export.package import export
 from btfkit.materials.neumip.material import in_precision
 
@@ -45,9 +45,18 @@ def example(folder: Path) -> Any:
 
 
 @pytest.mark.parametrize("name", list(SPECS))
-def test_a_shader_answers_as_the_material(name: str, device: None, tmp_path: Path) -> None:
+def test_wgsl_answers_as_the_material(name: str, device: None, tmp_path: Path) -> None:
     material, queries = made(name), asked()
     wgsl.write(material, material.program(), tmp_path)
+    agree(*example(tmp_path).evaluate(*queries), wanted(material, queries))
+
+
+@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler: apt-get install g++")
+@pytest.mark.parametrize("name", ["neumip", "rainer20", "neubtf-paper"])
+def test_slang_answers_as_the_material(name: str, tmp_path: Path) -> None:
+    needs.module("slangpy")
+    material, queries = made(name), asked()
+    slang.write(material, material.program(), tmp_path)
     agree(*example(tmp_path).evaluate(*queries), wanted(material, queries))
 
 
@@ -61,7 +70,7 @@ def test_networks_in_bfloat16_are_rounded_in_the_shader_too(device: None, tmp_pa
     assert error.max() <= 2e-2
 
 
-def test_the_example_answers_a_query_file(device: None, tmp_path: Path) -> None:
+def test_the_example_in_wgsl_answers_a_query_file(device: None, tmp_path: Path) -> None:
     material, queries, out = made("lambert"), asked(), tmp_path / "out"
     export(material, "wgsl", out)
     np.savez(tmp_path / "q.npz", **queries._asdict())
