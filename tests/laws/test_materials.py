@@ -413,6 +413,7 @@ def test_the_program_of_a_neubtf_with_parallax_moves_its_lookup_as_the_model_doe
 
 
 @every_model
+@pytest.mark.slow
 def test_lights_are_drawn_as_densely_as_said_and_answer_for_the_hemisphere(model: str) -> None:
     material, rng = fitted(model), np.random.default_rng(8)
     uv, view = rng.random((40, 2)), upper(rng, 40)

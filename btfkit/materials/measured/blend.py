@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,20 @@ Index = NDArray[np.intp]
 # With fewer partners than this on a side, a list of pairs is not a grid but scattered.
 _FEWEST_PARTNERS = 6
 _SCATTERED_NEIGHBOURS = 8
+
+
+class Nest(NamedTuple):
+    """Directions of one kind, each with the same ones of the other.
+
+    Attributes:
+        light_first: whether the outer ones are lights.
+        outer, inner: their triangulations. pairs: (outer, inner) index of each pair.
+    """
+
+    light_first: bool
+    outer: DirectionMesh
+    inner: DirectionMesh
+    pairs: Index
 
 
 @final
@@ -80,6 +94,19 @@ class Blend:
     def near(self) -> bool:
         """Whether weights depend on the place on the sample."""
         return self._lamps is not None or self._eyes is not None
+
+    def nest(self) -> Nest:
+        """The pairs as one table.
+
+        Raises:
+            TypeError: they are none: views have lights of their own, or lamps or eyes are near.
+        """
+        if self.near or self._tree is not None or len(self._meshes) != 1:
+            what = "near lights or views" if self.near else "views with lights of their own"
+            raise TypeError(f"this BTF has {what}; expected every view under every light")
+        mesh, lists = self._meshes[0]
+        home = self._home[:, 1]
+        return Nest(self._light_first, self._outer, mesh, lists[home])
 
     def _nest(
         self, pairs: Index, outer: Array, which: Index, inner: Array, which_inner: Index

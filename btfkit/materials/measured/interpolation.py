@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from btfkit.btf import BTF
 from btfkit.materials.base import Array, Header, Material
 from btfkit.materials.bilinear import corners
-from btfkit.materials.measured.blend import Blend, pair_arrays
+from btfkit.materials.measured.blend import Blend, Nest, pair_arrays
 from btfkit.nearfield import uv_places
 from btfkit.queries import Query
 
@@ -82,6 +82,22 @@ class Interpolation(Material):
         if btf.validity is not None:
             weights["texture.valid"] = btf.validity
         return Interpolation(spec_of(btf), weights, Header.of(btf))
+
+    def nest(self) -> Nest:
+        """Its pairs as one table; TypeError where views have lights of their own, or near ones."""
+        return self._blend.nest()
+
+    def light_cosines(self) -> Array:
+        """(n,) of the lights of the pairs."""
+        return np.asarray(self.weights["light"], np.float32)[:, 2]
+
+    def texture(self, pair: int) -> Array:
+        """(h, w, c) of a pair; NaN where it is not measured."""
+        values = np.array(self._btf.texture(pair), np.float32)
+        valid = self._btf.validity
+        if valid is not None:
+            values[~np.asarray(valid[pair if len(valid) > 1 else 0], bool)] = np.nan
+        return values
 
     @classmethod
     def shapes(cls, spec: InterpolationSpec, header: Header) -> dict[str, tuple[int, ...]]:

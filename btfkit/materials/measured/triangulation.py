@@ -7,7 +7,7 @@ makes every query of the hemisphere fall into a triangle.
 
 from __future__ import annotations
 
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,25 @@ def parabolic(direction: ArrayLike) -> Floats:
     """(..., 2) parabolic coordinates of (..., 3) unit vectors; the hemisphere is the unit disc."""
     d = np.asarray(direction, float)
     return d[..., :2] / (1 + d[..., 2:])
+
+
+class Tables(NamedTuple):
+    """A triangulation as arrays, for evaluators elsewhere.
+
+    Attributes:
+        rows: (t, 3) rows of the table of directions at each triangle's corners.
+        frame: (t, 2, 2), origin: (t, 2): barycentric coordinates of the first two corners are
+            frame x (p - origin), p parabolic.
+        cells, half: p in -half..half falls into one of cells x cells squares, x first.
+        reaching: (cells^2, k) the triangles that reach into each.
+    """
+
+    rows: Index
+    frame: Floats
+    origin: Floats
+    cells: int
+    half: float
+    reaching: Index
 
 
 @final
@@ -76,6 +95,11 @@ class DirectionMesh:
     def _cell(self, point: Floats) -> Index:
         cell = (point / self._half + 1) * (self._cells / 2)
         return np.clip(cell.astype(np.intp), 0, self._cells - 1)
+
+    def tables(self) -> Tables:
+        """The triangulation as arrays."""
+        rows = self.stands_for[self._triangles]
+        return Tables(rows, self._frame, self._origin, self._cells, self._half, self._reaching)
 
     def weights(self, direction: NDArray[np.floating]) -> tuple[Index, Floats]:
         """Three rows of the table and their weights, not negative and of sum 1.

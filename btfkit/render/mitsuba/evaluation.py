@@ -3,28 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, final
+from dataclasses import replace
+from typing import Any, NamedTuple, final
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from btfkit.conventions import (
+    CURVATURE_UNIT,
     EPSILON,
     LEAK,
     LEVELS_UNIT,
-    LOOKS,
     LOWEST_COSINE,
+    LOWEST_SEEN,
     MOST_LOG,
-    STEEPEST,
     displacement,
 )
 from btfkit.native.neural.plain import YUV_TO_RGB
 from btfkit.program import Dense, Heights, Program, Texture, frame_products
+from btfkit.render.mitsuba.march import Met, on_curved, on_plane, turned
+from btfkit.render.mitsuba.pyramid import Pyramid, Surface
+from btfkit.render.picture import to_rgb
 
 Numbers = list[Any]
+_TOGETHER = 8
 # 38,000 took LLVM nine minutes, 3,000 five seconds.
 MOST_WEIGHTS = 12000
+
+
+class Seen(NamedTuple):
+    """All that does not depend on the light.
+
+    Attributes:
+        uv, view: as asked. met: where the view ray ends. level: of detail.
+        turned: the view in the frame where the ray ends.
+        values: numbers of the textures that no light moves, by name.
+    """
+
+    uv: Numbers
+    view: Numbers
+    met: Met
+    level: Any
+    curvature: Any
+    turned: Numbers
+    values: dict[str, Numbers]
 
 
 @final
@@ -34,17 +57,16 @@ class Evaluation:
     Args:
         program: what is computed.
 
+    Attributes:
+        pyramids: the textures by name; gradients may flow into their `texels`.
+        rgb: (c, 3) rows from channels to linear RGB.
+
     Raises:
-        TypeError: the view ray bends with curvature, or too large networks.
+        TypeError: too large networks.
     """
 
     def __init__(self, program: Program) -> None:
         found = program.depth
-        if isinstance(found, Heights) and found.curved:
-            raise TypeError(
-                "the view ray of this material bends with curvature, which Mitsuba's shapes do "
-                "not tell; expected one whose heights lie on the plane"
-            )
         depth_layers = getattr(found, "layers", ())
         weights = sum(layer.weight.size for layer in (*program.layers, *depth_layers))
         if weights > MOST_WEIGHTS:
@@ -53,96 +75,153 @@ class Evaluation:
                 f"at most {MOST_WEIGHTS}: fit a smaller model, or export to C++"
             )
         self._program = program
-        self._pyramids = {t.name: _Pyramid(t.levels, program.wrap) for t in program.textures}
-        if program.scaling:
-            self._pyramids[program.scaling.name] = _Pyramid(program.scaling.levels, program.wrap)
+        self.rgb = to_rgb(program.channels).tolist()
+        self._textures = [*program.textures, *([program.scaling] if program.scaling else [])]
+        self.pyramids = {t.name: Pyramid(t.levels, program.wrap) for t in self._textures}
         if isinstance(found, Heights):
-            self._heights = _Pyramid((found.heights[..., None],), program.wrap)
+            self._surface = Surface(found.heights, program.wrap)
         elif found is not None:
-            self._heights = _Pyramid(found.texture.levels[:1], program.wrap)
+            self._offset = Pyramid(found.texture.levels[:1], program.wrap)
+
+    @property
+    def passes(self) -> bool:
+        """Whether view rays may pass the material: where it is partly covered, or curved."""
+        return self._program.opacity != "none"
+
+    @property
+    def curved(self) -> bool:
+        """Whether curvature bends view rays."""
+        return isinstance(self._program.depth, Heights) and self._program.depth.curved
 
     def __call__(
-        self, uv: Numbers, light: Numbers, view: Numbers, footprint: Any, active: Any
+        self,
+        uv: Numbers,
+        light: Numbers,
+        view: Numbers,
+        footprint: Any,
+        active: Any,
+        curvature: Any = 0.0,
     ) -> tuple[Numbers, Any]:
         """Reflectance by channel, and opacity.
 
         Args:
             uv: u and v, in one tile or clamped to it. light, view: x, y, z of unit vectors.
             footprint: texels of the data's grid. active: which lanes are asked.
+            curvature: along the projected view ray, 1/tile width.
         """
+        return self.answer(self.seen(uv, view, footprint, active, curvature), light, active)
+
+    def seen(
+        self, uv: Numbers, view: Numbers, footprint: Any, active: Any, curvature: Any = 0.0
+    ) -> Seen:
+        """The part of an answer that all lights of a view share; arguments as in a call."""
         program = self._program
         level = dr.log2(2 * dr.clip(footprint, 0.5, 1e30)) if program.leveled else 0 * footprint
-        known = _known(light, view, level)
-        depth = self._depth(uv, view, known, active)
-        values = {}
-        for texture in [*program.textures, *([program.scaling] if program.scaling else [])]:
-            u, v = self._moved(texture, uv, light, view, depth)
-            values[texture.name] = self._pyramids[texture.name](
-                u, v, level - float(texture.shift), active
-            )
+        bent = mi.Float(curvature)
+        met = self._met(uv, view, level, bent, active)
+        turn = view
+        if self.curved:
+            turn = turned(view, view, met.turn)
+            turn[2] = dr.select(met.turn == 0, turn[2], dr.maximum(turn[2], LOWEST_SEEN))
+        found = Seen(uv, view, met, level, bent, turn, {})
+        for texture in self._textures:
+            if not texture.light:
+                found.values[texture.name] = self._looked_up(texture, found, None, active)
+        return found
+
+    def answer(self, seen: Seen, light: Numbers, active: Any) -> tuple[Numbers, Any]:
+        """Reflectance by channel under a light, and opacity."""
+        program = self._program
+        values = dict(seen.values)
+        for texture in self._textures:
+            if texture.light:
+                values[texture.name] = self._looked_up(texture, seen, light, active)
+        toward = turned(light, seen.view, seen.met.turn) if self.curved else light
+        known = _known(toward, seen.turned, seen.level, seen.curvature)
         for texture in program.textures:
             known |= dict(zip(texture.features, values[texture.name], strict=True))
         names = iter(frame_products(program.frames))
         half = [known[name] for name in ("hx", "hy", "hz")]
         for k in range(program.frames):
             axis = values[program.textures[0].name][3 * k : 3 * k + 3]
-            for direction in (half, light):
+            for direction in (half, toward):
                 known[next(names)] = sum(a * b for a, b in zip(axis, direction, strict=True))
-        raw = _run(program.layers, [known[n] for n in program.inputs], rounded=program.rounded)
+        raw = self._run(known)
         white = values[program.scaling.name] if program.scaling else None
-        return self._output(raw, light, white)
+        rgb, opacity = self._output(raw, toward, white)
+        if program.opacity == "march":
+            # Zero, not masked: what is masked would be compiled once more.
+            lit = (seen.met.opacity > 0) & (toward[2] > 0)
+            rgb, opacity = [dr.select(lit, value, 0) for value in rgb], seen.met.opacity
+        return rgb, opacity
 
-    def _depth(self, uv: Numbers, view: Numbers, known: dict[str, Any], active: Any) -> Any:
-        found = self._program.depth
+    def place(self, seen: Seen) -> Numbers:
+        """Where on the tile the view ray ends, u and v."""
+        low = dr.maximum(seen.view[2], LOWEST_COSINE)
+        moves = displacement(seen.view[0], seen.view[1], low, self._program.aspect)
+        return [x + seen.met.depth * move for x, move in zip(seen.uv, moves, strict=True)]
+
+    def opacity(self, seen: Seen, active: Any) -> Any:
+        """Of a view alone, however it is lit."""
+        if self._program.opacity == "head":
+            # The head hears of the light, too; it was trained to tell all lights the same.
+            return self.answer(seen, [0 * seen.level, 0 * seen.level, 1 + 0 * seen.level], active)[
+                1
+            ]
+        return seen.met.opacity
+
+    def _run(self, known: dict[str, Any]) -> Numbers:
+        """The layers; numbers of the view are summed first, so that lights share the sums."""
+        program = self._program
+        names = program.inputs
+        if not program.layers:
+            return [known[name] for name in names]
+        lit = {"lx", "ly", "lz", "hx", "hy", "hz", "cos_diff", "lx_disc", "ly_disc"}
+        lit |= {name for t in program.textures if t.light for name in t.features}
+        late = [name in lit or name.startswith("frame.") for name in names]
+        order = sorted(range(len(names)), key=lambda k: late[k])
+        first, *rest = program.layers
+        if not first.residual:
+            first = replace(first, weight=first.weight[:, order])
+            names = tuple(names[k] for k in order)
+        return _run([first, *rest], [known[n] for n in names], rounded=program.rounded)
+
+    def _met(self, uv: Numbers, view: Numbers, level: Any, bent: Any, active: Any) -> Met:
+        program, found = self._program, self._program.depth
+        whole, none = mi.Float(1), mi.Float(0)
         if found is None:
-            return None
-        if not isinstance(found, Heights):
-            psi = self._heights(uv[0], uv[1], 0 * uv[0], active)
-            columns = known | dict(zip(found.texture.features, psi, strict=True))
-            inputs = [columns[name] for name in found.inputs]
-            return _run(found.layers, inputs, rounded=self._program.rounded)[0] * float(found.scale)
-        low, scale = dr.maximum(view[2], STEEPEST), float(found.scale)
-        along = displacement(view[0] / low * scale, view[1] / low * scale, 1, self._program.aspect)
-        met = self._crossing(found.heights, uv, along, active)
-        return met * dr.maximum(view[2], LOWEST_COSINE) / low * scale
+            return Met(none, whole, none)
+        if isinstance(found, Heights):
+            flat = on_plane(found, self._surface, uv, view, program.aspect, active)
+            if not found.curved:
+                return Met(flat, whole, none)
+            bends = active & (bent != 0)
+            met = on_curved(found, self._surface, uv, view, bent, program.aspect, bends)
+            return Met(
+                *(dr.select(bends, a, b) for a, b in zip(met, (flat, whole, none), strict=True))
+            )
+        psi = self._offset(uv[0], uv[1], 0 * uv[0], active)
+        columns = _known(view, view, level, none)
+        columns |= dict(zip(found.texture.features, psi, strict=True))
+        inputs = [columns[name] for name in found.inputs]
+        depth = _run(found.layers, inputs, rounded=program.rounded)[0] * float(found.scale)
+        return Met(depth, whole, none)
 
-    def _crossing(self, heights: Any, uv: Numbers, along: Sequence[Any], active: Any) -> Any:
-        """As `native.neural.plain.crossing`."""
-        h, w = heights.shape
-        top, bottom = float(heights.max()), float(heights.min())
-
-        def above(t: Any) -> Any:
-            u, v = uv[0] + t * along[0], uv[1] + t * along[1]
-            return t - self._heights(u, v, 0 * t, active)[0]
-
-        def met(high: Any, low: Any, gap: Any, under: Any) -> Any:
-            return high + (low - high) * (gap / dr.maximum(gap - under, 1e-12))
-
-        texels = dr.maximum(dr.abs(along[0]) * w, dr.abs(along[1]) * h) * (top - bottom)
-        count = dr.clip(dr.ceil(texels), 1, LOOKS)
-        low = high = mi.Float(top) + 0 * uv[0]
-        under = gap = above(low)
-        going = mi.Bool(True)
-        for k in range(1, LOOKS + 1):
-            high, gap = dr.select(going, low, high), dr.select(going, under, gap)
-            low = dr.select(going, top + (bottom - top) * dr.minimum(k / count, 1), low)
-            under = dr.select(going, above(low), under)
-            going &= under > 0
-        first = met(high, low, gap, under)
-        rest = above(first)
-        return dr.select(rest > 0, met(first, low, rest, under), met(high, first, gap, rest))
-
-    def _moved(
-        self, texture: Texture, uv: Numbers, light: Numbers, view: Numbers, depth: Any
+    def _looked_up(
+        self, texture: Texture, seen: Seen, light: Numbers | None, active: Any
     ) -> Numbers:
-        if depth is None or not (texture.view or texture.light):
-            return uv
-        place = list(uv)
-        for way, share in ((view, texture.view), (light, -texture.light)):
-            cosine = dr.maximum(way[2], LOWEST_COSINE)
-            moves = displacement(way[0], way[1], cosine, self._program.aspect)
-            place = [x + depth * float(share) * move for x, move in zip(place, moves, strict=True)]
-        return place
+        place = list(seen.uv)
+        if self._program.depth is not None:
+            for way, share in ((seen.view, texture.view), (light, -texture.light)):
+                if not share or way is None:
+                    continue
+                moves = displacement(
+                    way[0], way[1], dr.maximum(way[2], LOWEST_COSINE), self._program.aspect
+                )
+                place = [x + seen.met.depth * float(share) * move
+                         for x, move in zip(place, moves, strict=True)]  # fmt: skip
+        level = seen.level - float(texture.shift)
+        return self.pyramids[texture.name](place[0], place[1], level, active)
 
     def _output(self, raw: Numbers, light: Numbers, white: Numbers | None) -> tuple[Numbers, Any]:
         heads: dict[str, Numbers] = {}
@@ -166,56 +245,7 @@ class Evaluation:
         return [_expm1(dr.clip(y, 0, MOST_LOG)) for y in logs], opacity
 
 
-@final
-class _Pyramid:
-    """Levels of a texture in one buffer."""
-
-    def __init__(self, levels: Sequence[Any], wrap: bool) -> None:
-        self._wrap, self._count, self._channels = wrap, len(levels), levels[0].shape[-1]
-        sizes = np.array([level.shape[:2] for level in levels], np.uint32)
-        starts = np.cumsum([0, *(int(h) * int(w) for h, w in sizes)])[:-1].astype(np.uint32)
-        flat = [np.asarray(level, np.float32).reshape(-1) for level in levels]
-        self._texels = mi.Float(np.concatenate(flat))
-        self._heights, self._widths = (mi.UInt32(sizes[:, k].copy()) for k in range(2))
-        self._starts = mi.UInt32(starts)
-
-    def __call__(self, u: Any, v: Any, level: Any, active: Any) -> Numbers:
-        """Every channel, between texels and levels."""
-        at = dr.clip(level, 0, self._count - 1)
-        finer = mi.UInt32(at)
-        found = self._level(u, v, finer, active)
-        if self._count == 1:
-            return found
-        share = at - mi.Float(finer)
-        coarser = self._level(u, v, dr.minimum(finer + 1, self._count - 1), active)
-        return [a + share * (b - a) for a, b in zip(found, coarser, strict=True)]
-
-    def _level(self, u: Any, v: Any, s: Any, active: Any) -> Numbers:
-        w, h, start = (dr.gather(mi.UInt32, table, s, active)
-                       for table in (self._widths, self._heights, self._starts))  # fmt: skip
-        (x0, x1, fx), (y0, y1, fy) = self._beside(u, w), self._beside(v, h)
-        rows = [(start + y * w, share) for y, share in ((y0, 1 - fy), (y1, fy))]
-        taps = [((row + x) * self._channels, share * part)
-                for row, share in rows for x, part in ((x0, 1 - fx), (x1, fx))]  # fmt: skip
-        return [
-            sum(share * dr.gather(mi.Float, self._texels, at + k, active) for at, share in taps)
-            for k in range(self._channels)
-        ]
-
-    def _beside(self, place: Any, size: Any) -> tuple[Any, Any, Any]:
-        wide = mi.Float(size)
-        inside = place - dr.floor(place) if self._wrap else dr.clip(place, 0, 1)
-        at = inside * wide - 0.5
-        low = dr.floor(at)
-        first, most = mi.Int32(low), mi.Int32(size) - 1
-        second = first + 1
-        if self._wrap:
-            first = dr.select(first < 0, most, first)
-            second = dr.select(second > most, 0, second)
-        return mi.UInt32(dr.clip(first, 0, most)), mi.UInt32(dr.clip(second, 0, most)), at - low
-
-
-def _known(light: Numbers, view: Numbers, level: Any) -> dict[str, Any]:
+def _known(light: Numbers, view: Numbers, level: Any, curvature: Any) -> dict[str, Any]:
     total = [a + b for a, b in zip(light, view, strict=True)]
     length = dr.sqrt(sum(x * x for x in total))
     none = length < 1e-6
@@ -224,7 +254,7 @@ def _known(light: Numbers, view: Numbers, level: Any) -> dict[str, Any]:
     found = dict(zip(("lx", "ly", "lz", "vx", "vy", "vz"), (*light, *view), strict=True))
     found |= dict(zip(("hx", "hy", "hz"), half, strict=True))
     found |= {"cos_diff": dr.select(none, 0, length / 2), "level": level / LEVELS_UNIT}
-    found["curvature"] = 0 * level
+    found["curvature"] = curvature / (CURVATURE_UNIT + dr.abs(curvature))
     for name, way in (("l", light), ("v", view)):
         sine = dr.sqrt(way[0] * way[0] + way[1] * way[1])
         stretch = dr.select(sine > 1e-6, dr.atan2(sine, way[2]) / dr.maximum(sine, 1e-6), 1)
@@ -235,12 +265,14 @@ def _known(light: Numbers, view: Numbers, level: Any) -> dict[str, Any]:
 
 def _run(layers: Sequence[Dense], x: Numbers, *, rounded: bool) -> Numbers:
     for k, layer in enumerate(layers):
-        sums = []
-        for row, bias in zip(layer.weight.tolist(), layer.bias.tolist(), strict=True):
-            total = mi.Float(bias)
-            for weight, value in zip(row, x, strict=True):
-                total = dr.fma(weight, value, total)
-            sums.append(total)
+        weights = layer.weight.tolist()
+        sums = [mi.Float(bias) for bias in layer.bias.tolist()]
+        # A few sums at a time: as many chains as the units take, and they stay in registers.
+        for first in range(0, len(sums), _TOGETHER):
+            rows = range(first, min(first + _TOGETHER, len(sums)))
+            for column, value in enumerate(x):
+                for row in rows:
+                    sums[row] = dr.fma(weights[row][column], value, sums[row])
         if layer.gain is not None and layer.centre is not None:
             sums = _normalised(sums, layer.gain.tolist(), layer.centre.tolist())
         y = [_activated(layer, layer.omega * z if layer.omega != 1 else z) for z in sums]
