@@ -15,6 +15,7 @@ from typing import Any
 
 
 def scene(mi: Any, bsdf: dict[str, Any], *, integrator: str) -> Any:
+    """The scene with a BSDF on the sphere and on the floor."""
     look = mi.ScalarTransform4f().look_at([0, -4, 2], [0, 0, 0], [0, 0, 1])
     floor = mi.ScalarTransform4f().translate([0, 0, -1]).scale(4)
     return mi.load_dict({
@@ -40,6 +41,7 @@ def seconds(mi: Any, made: Any, *, count: int) -> tuple[float, float]:
 
 
 def main() -> None:
+    """One line for `diffuse`, one for the model."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", type=Path)
     parser.add_argument("--count", type=int, default=5)

@@ -37,6 +37,7 @@ def _next(target: str, out: Path) -> str:
     """How the example of an export is run."""
     folder = shlex.quote(str(out))
     return {
+        "mitsuba": f"python {folder}/render.py",
         "npz": f"python {folder}/evaluate.py queries.npz answers.npz",
         "cpp": f"cd {folder} && c++ -O3 -std=c++17 example.cpp -o example && ./example",
         "glsl": f"open {folder}/example.html in a browser",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 # Target -> function (material, program, folder) that writes it.
 TARGETS: dict[str, str] = {
+    "mitsuba": "btfkit.export.mitsuba:write",
     "npz": "btfkit.export.npz:write",
     "cpp": "btfkit.export.cpp:write",
     "glsl": "btfkit.export.glsl:write",
@@ -13,3 +14,5 @@ TARGETS: dict[str, str] = {
     "wgsl": "btfkit.export.wgsl:write",
     "slang": "btfkit.export.slang:write",
 }
+# Those that ask the material itself, whatever its program is made of.
+ASKED: tuple[str, ...] = ("mitsuba",)

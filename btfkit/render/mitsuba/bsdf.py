@@ -42,7 +42,8 @@ def _classes() -> tuple[Any, Any]:
         def __init__(self, props: Any) -> None:
             mi.BSDF.__init__(self, props)
             self._name = str(props["filename"])
-            material = self._opened(Path(self._name))
+            # As other plugins' files: beside the scene, too.
+            material = self._opened(Path(str(mi.file_resolver().resolve(self._name))))
             self._asked = Asked(
                 repeat=float(props.get("repeat", 1.0)),
                 grid=material.header.grid,

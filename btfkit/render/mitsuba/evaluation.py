@@ -21,7 +21,7 @@ from btfkit.conventions import (
     displacement,
 )
 from btfkit.native.neural.plain import YUV_TO_RGB
-from btfkit.program import Dense, Heights, Program, Texture, frame_products
+from btfkit.program import Dense, Heights, OffsetNetwork, Program, Texture, frame_products
 from btfkit.render.mitsuba.march import Met, on_curved, on_plane, turned
 from btfkit.render.mitsuba.pyramid import Pyramid, Surface
 from btfkit.render.picture import to_rgb
@@ -67,6 +67,11 @@ class Evaluation:
 
     def __init__(self, program: Program) -> None:
         found = program.depth
+        if program.cover is not None or isinstance(found, OffsetNetwork):
+            raise TypeError(
+                "this material has networks of opacity and offset of its own, which are not "
+                "traced; expected one whose rays end at heights or by a network of depth"
+            )
         depth_layers = getattr(found, "layers", ())
         weights = sum(layer.weight.size for layer in (*program.layers, *depth_layers))
         if weights > MOST_WEIGHTS:
