@@ -143,10 +143,16 @@ class Material(ABC):
         """Whether `_answer_lights` saves anything over asking query by query."""
         return False
 
-    def _answer_lights(self, query: Query) -> tuple[Array, Array | None]:
-        """Reflectance (m, b, c) and opacity (b,) of b views under m lights that they share.
+    @property
+    def shares_views(self) -> bool:
+        """Whether several lights of a view cost less together than one by one."""
+        return self._keeps_views()
 
-        As `_answer`, but `query.light` is (m, 3). Called where `_keeps_views`.
+    def _answer_lights(self, query: Query) -> tuple[Array, Array | None]:
+        """Reflectance (m, b, c) and opacity (b,) of b views under m lights.
+
+        As `_answer`, but `query.light` is (m, 3), which all share, or (m, b, 3), where a vector of
+        zeros is not asked and answers 0. Called where `_keeps_views`.
         """
         raise NotImplementedError
 
@@ -262,6 +268,47 @@ class Material(ABC):
             masked += self._answer_block(block, rgb[some], opacity[some])
         _warn_of_masked(masked, b)
         return Response(rgb.reshape(*shape, c), opacity.reshape(shape))
+
+    @final
+    def under_lights(
+        self,
+        uv: NDArray[Any],
+        lights: Array,
+        view: NDArray[Any],
+        footprint: NDArray[Any],
+        curvature: NDArray[Any],
+    ) -> Response:
+        """Each of b views under m lights of its own; what does not depend on light is found once.
+
+        Args:
+            uv, view, footprint, curvature: (b, ...) as in `evaluate`.
+            lights: (m, b, 3) float32 unit vectors; of zeros where a light is not asked for, as
+                below the horizon of a material that does not answer there.
+
+        Returns:
+            reflectance (m, b, c), 0 for lights that are not asked for, and opacity (b,).
+        """
+        m, b, _ = lights.shape
+        rgb = np.zeros((m, b, len(self.header.channels)), np.float32)
+        opacity = np.ones(b, np.float32)
+        if not self._keeps_views():
+            for light, answer in zip(lights, rgb, strict=True):
+                rows = np.flatnonzero(light.any(axis=1))
+                if rows.size:
+                    parts = (uv[rows], light[rows], view[rows], footprint[rows], curvature[rows])
+                    answer[rows], opacity[rows] = self.evaluate(*parts)
+            return Response(rgb, opacity)
+        query, _ = queries.flatten(uv, np.asarray([0, 0, 1]), view, footprint, curvature)
+        ready = self._ready(query, opacity, below=True)
+        rows = slice(None) if ready.rows is None else ready.rows
+        own = np.ascontiguousarray(lights[:, rows])
+        values, found = self._answer_lights(_spread(ready)._replace(light=own))
+        if found is not None:
+            opacity[rows] = found
+            values = np.where(found[:, None] > 0, values, np.float32(0))
+        rgb[:, rows] = values
+        _warn_of_masked(ready.masked, b)
+        return Response(rgb, opacity)
 
     def _under_shared_lights(
         self,

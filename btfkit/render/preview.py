@@ -5,6 +5,8 @@ Only what is seen is ever asked, and only for lights that reach it.
 
 from __future__ import annotations
 
+import itertools
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.materials.base import Material
+from btfkit.render.area import AreaLight
 from btfkit.render.environment import Environment
 from btfkit.render.gaze import Gaze, gaze
-from btfkit.render.sampling import PixelSamples
+from btfkit.render.sampling import STEP, PixelSamples
 from btfkit.render.shadows import Shadows
 from btfkit.shapes.camera import Camera
 from btfkit.shapes.closed import NEAR, Floats, Meeting, Plane, Shape, Surface
@@ -25,7 +28,11 @@ Ints = NDArray[np.intp]
 # Rays traced at once: many, since a lazy BTF decodes its textures anew for each block. Sheets that
 # a ray may pass. The share of light not worth following.
 _BLOCK, _MOST_SHEETS, _NOTHING = 1 << 18, 64, 1e-3
-_ABOVE = np.array([0.0, 0.0, 1.0])
+# Lights times points whose answers are held at once, and points below which that saves nothing.
+_HELD, _FEWEST = 1 << 19, 1 << 11
+# Rays a pixel that are followed in one pass, so that a lazy BTF is decoded once.
+_ONE_PASS = 4
+_ABOVE = np.array([0.0, 0.0, 1.0], np.float32)
 
 
 @final
@@ -40,6 +47,7 @@ class Scene:
             that faces it 1.
         environment: light from everywhere, or None.
         irradiance: (n,) of each light on a surface that faces it; None is 1 of each.
+        panels: area lights near the object.
     """
 
     material: Material
@@ -47,6 +55,7 @@ class Scene:
     lights: Floats
     environment: Environment | None = None
     irradiance: Sequence[float] | None = None
+    panels: Sequence[AreaLight] = ()
 
 
 class Rendering(NamedTuple):
@@ -57,11 +66,15 @@ class Rendering(NamedTuple):
             it faces, or in an environment of radiance 1, is 1.
         cover: (h, w) share of the pixel that is covered, 0 to 1.
         asked: queries that the material answered.
+        samples: rays a pixel that were followed.
+        interrupted: whether an interruption ended it before all of them were.
     """
 
     radiance: NDArray[np.float32]
     cover: NDArray[np.float32]
     asked: int
+    samples: int = 1
+    interrupted: bool = False
 
 
 def camera_of(shape: Shape, view: Sequence[float] | Floats, size: tuple[int, int]) -> Camera:
@@ -75,13 +88,13 @@ def enough_samples(scene: Scene, view: Sequence[float] | Floats, size: tuple[int
     """Rays a pixel that a picture needs.
 
     One where a plane is seen straight from above and its texels are no finer than pixels; 64 under
-    an environment; else 4, and as many as there are texels in a pixel, 64 at most, where the
-    material has no levels of detail.
+    an environment or a panel; else 4, and as many as there are texels in a pixel, 64 at most, where
+    the material has no levels of detail.
     """
     camera, header = camera_of(scene.shape, view, size), scene.material.header
     texels = float(np.linalg.norm(camera.right)) / scene.shape.tile * max(header.grid)
     straight = isinstance(scene.shape, Plane) and abs(camera.direction[2]) > 1 - 1e-9
-    if scene.environment is not None:
+    if scene.environment is not None or scene.panels:
         return 64
     fine = texels > 1 + 1e-6 and not scene.material.has_levels
     if fine:
@@ -96,9 +109,10 @@ def render(
     size: tuple[int, int] = (512, 512),
     samples: int = 1,
     seed: int = 0,
+    within_s: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Rendering:
-    """Render a picture.
+    """Render a picture, in passes that each double the rays of a pixel.
 
     Args:
         scene: what is seen.
@@ -106,30 +120,52 @@ def render(
         size: (h, w) pixels.
         samples: rays a pixel; one goes through its centre.
         seed: of the shifts of samples between pixels.
-        progress: called with (pixels done, pixels).
+        within_s: seconds after which no further pass begins that is expected to end later; the
+            first is always finished.
+        progress: called with (rays done, rays).
+
+    An interruption after the first pass ends the picture; before, it is passed on.
     """
     h, w = size
     c = len(scene.material.header.channels)
     painter = _Painter(
         scene, camera_of(scene.shape, view, size), PixelSamples(size, samples, seed=seed)
     )
-    radiance, cover = np.zeros((h * w, c), np.float32), np.zeros(h * w, np.float32)
-    step = max(_BLOCK // samples, 1)
-    for start in range(0, h * w, step):
-        pixels = np.arange(start, min(start + step, h * w))
-        light, share = painter.paint(pixels)
-        block = slice(start, start + len(pixels))
-        radiance[block] = light.reshape(len(pixels), samples, c).mean(axis=1)
-        cover[block] = share.reshape(len(pixels), samples).mean(axis=1)
-        if progress:
-            progress(start + len(pixels), h * w)
+    radiance, cover = np.zeros((h * w, c)), np.zeros(h * w)
+    start, done, interrupted = time.perf_counter(), 0, False
+    for some in _passes(samples, within_s):
+        spent = time.perf_counter() - start
+        if done and within_s is not None and spent * (1 + len(some) / done) > within_s:
+            break
+        try:
+            light, share = painter.paint_pass(some, progress)
+        except KeyboardInterrupt:
+            if not done:
+                raise
+            interrupted = True
+            break
+        radiance += light
+        cover += share
+        done += len(some)
     if painter.not_finite:
         warnings.warn(
             f"{painter.not_finite} of {painter.asked} answers of the material are not finite; "
             "they count as black",
             stacklevel=2,
         )
-    return Rendering(radiance.reshape(h, w, c), cover.reshape(h, w), painter.asked)
+    mean = (radiance / done).astype(np.float32), (cover / done).astype(np.float32)
+    return Rendering(
+        mean[0].reshape(h, w, c), mean[1].reshape(h, w), painter.asked, done, interrupted
+    )
+
+
+def _passes(samples: int, within_s: float | None) -> list[range]:
+    """Which samples each pass takes: few at first where time is short or pixels take many."""
+    first = samples if within_s is None and samples <= _ONE_PASS else 1
+    bounds = [0, min(first, samples)]
+    while bounds[-1] < samples:
+        bounds.append(min(2 * bounds[-1], samples))
+    return [range(a, b) for a, b in itertools.pairwise(bounds)]
 
 
 @final
@@ -148,12 +184,30 @@ class _Painter:
         """Queries that the material answered so far."""
         return self._own + self._shadows.asked
 
-    def paint(self, pixels: Ints) -> tuple[Floats, Floats]:
-        """Radiance (m, c), premultiplied, and cover (m,) of all rays of some pixels."""
+    def paint_pass(
+        self, some: range, progress: Callable[[int, int], None] | None
+    ) -> tuple[Floats, Floats]:
+        """Sums over some samples of every pixel: radiance (p, c), premultiplied, and cover (p,)."""
+        pixels = self._drawn.size[0] * self._drawn.size[1]
+        c = len(self._scene.material.header.channels)
+        radiance, cover = np.zeros((pixels, c)), np.zeros(pixels)
+        step = max(_BLOCK // len(some), 1)
+        for start in range(0, pixels, step):
+            at = np.arange(start, min(start + step, pixels))
+            light, share = self._paint(at, some)
+            radiance[at] = light.reshape(len(at), len(some), c).sum(axis=1)
+            cover[at] = share.reshape(len(at), len(some)).sum(axis=1)
+            if progress:
+                done = some.start * pixels + (start + len(at)) * len(some)
+                progress(done, pixels * self._drawn.samples)
+        return radiance, cover
+
+    def _paint(self, pixels: Ints, some: range) -> tuple[Floats, Floats]:
+        """Radiance (m, c), premultiplied, and cover (m,) of some rays of some pixels."""
         scene, toward = self._scene, -self._camera.direction
-        origin = self._camera.origins(self._drawn.places(pixels))
+        origin = self._camera.origins(self._drawn.places(pixels, some))
         direction = np.broadcast_to(self._camera.direction, origin.shape)
-        numbers = self._drawn.lights(pixels)
+        numbers = self._drawn.lights(pixels, some)
         radiance = np.zeros((len(origin), len(scene.material.header.channels)))
         through, beyond = np.ones(len(origin)), np.full(len(origin), -np.inf)
         alive = np.arange(len(origin))
@@ -182,38 +236,81 @@ class _Painter:
         scene, count = self._scene, len(seen.uv)
         total = np.zeros((count, len(scene.material.header.channels)))
         opacity: Floats = np.ones(count)
-        strength = scene.irradiance or [1.0] * len(scene.lights)
-        sources: list[tuple[Floats, Floats]] = [
-            (np.broadcast_to(light, (count, 3)), np.full((1, 1), irradiance))
-            for light, irradiance in zip(scene.lights, strength, strict=True)
-        ]
-        if scene.environment is not None:
-            sources.append(scene.environment.sample(numbers, seen.frame[:, 2]))
-        for index, (light, weight) in enumerate(sources):
-            local = np.einsum("ijk,ik->ij", seen.frame, light)
-            lit = scene.material.full_sphere | (local[:, 2] > 0)
-            # Holes are asked for once, lit or not, by a light that every material answers.
-            ask_holes = index == 0 and self._shadows.holes
-            rows = np.arange(count) if ask_holes else np.flatnonzero(lit)
-            if not rows.size:
-                continue
-            rgb, cover = self._answer(
-                seen.uv[rows], np.where(lit[rows, None], local[rows], _ABOVE), seen.view[rows],
-                seen.footprint[rows], seen.curvature[rows],
-            )  # fmt: skip
-            if ask_holes:
-                opacity = cover
-            reached = lit[rows] * self._shadows.reached(surface, seen, light, local, rows)
-            share = np.broadcast_to(weight, (count, weight.shape[1]))[rows]
-            total[rows] += rgb * share * reached[:, None]
+        drawn = self._drawn_lights(surface, seen, numbers)
+        sources = np.arange(len(scene.lights) + len(drawn))
+        # Where the views of several lights are shared, few points and all lights; else one light.
+        shared = scene.material.shares_views and len(sources) > 1
+        points = max(_HELD // len(sources), _FEWEST) if shared else count
+        together = len(sources) if shared else 1
+        for first in range(0, count, points):
+            at = slice(first, first + points)
+            part = Surface(*(row[at] for row in surface)), Gaze(*(row[at] for row in seen))
+            own = [(way[at], weight[at]) for way, weight in drawn]
+            for start in range(0, len(sources), together):
+                light, cover = self._under(*part, sources[start : start + together], own)
+                total[at] += light
+                if start == 0 and self._shadows.holes:
+                    opacity[at] = cover
         return total, opacity
 
-    def _answer(self, *query: Floats) -> tuple[Floats, Floats]:
+    def _drawn_lights(
+        self, surface: Surface, seen: Gaze, numbers: Floats
+    ) -> list[tuple[Floats, Floats]]:
+        """Directions (m, 3) and weights (m, 1 or c) of lights that differ from point to point."""
+        drawn = [
+            panel.sample((numbers + k * STEP) % 1, surface.point)
+            for k, panel in enumerate(self._scene.panels, 1)
+        ]
+        if self._scene.environment is not None:
+            drawn.append(self._scene.environment.sample(numbers, seen.frame[:, 2]))
+        return drawn
+
+    def _under(
+        self, surface: Surface, seen: Gaze, which: Ints, drawn: list[tuple[Floats, Floats]]
+    ) -> tuple[Floats, Floats]:
+        """Radiance (m, c) that some lights make, and opacity (m,) where it was asked for."""
+        scene, count = self._scene, len(seen.uv)
+        distant = len(scene.lights)
+        frame = seen.frame.astype(np.float32)
+        local = np.empty((len(which), count, 3), np.float32)
+        reached = np.empty((len(which), count), np.float32)
+        for row, k in enumerate(which):
+            if k < distant:
+                way = np.broadcast_to(scene.lights[k], (count, 3))
+                np.matmul(frame.reshape(-1, 3), scene.lights[k].astype(np.float32),
+                          out=local[row].reshape(-1))  # fmt: skip
+            else:
+                way = drawn[k - distant][0]
+                local[row] = np.einsum("ijk,ik->ij", frame, way)
+            lit = scene.material.full_sphere | (local[row, :, 2] > 0)
+            reached[row] = lit
+            if not self._shadows.none_on(seen):
+                rows = np.flatnonzero(lit)
+                reached[row, rows] = self._shadows.reached(surface, seen, way, local[row], rows)
+        asked = reached > 0
+        # A vector of zeros is not asked.
+        local *= asked[..., None]
+        if self._shadows.holes and which[0] == 0:
+            # Holes are asked for once, lit or not, by a light that every material answers.
+            dark = np.flatnonzero(~asked.any(axis=0))
+            local[0, dark] = _ABOVE
+            self._own += len(dark)
+        self._own += int(np.count_nonzero(asked))
+        rgb, cover = self._answer(seen, local)
+        total = np.zeros((count, rgb.shape[2]))
+        strength = scene.irradiance or [1.0] * distant
+        for row, k in enumerate(which):
+            weight = strength[k] if k < distant else drawn[k - distant][1]
+            total += rgb[row] * (reached[row, :, None] * weight)
+        return total, cover
+
+    def _answer(self, seen: Gaze, local: NDArray[np.float32]) -> tuple[Floats, Floats]:
         """What the material answers; what is not finite counts as black and opaque."""
-        rgb, cover = self._scene.material.evaluate(*query)
-        self._own += len(rgb)
-        bad = ~np.isfinite(cover) | ~np.isfinite(rgb).all(axis=1)
-        if bad.any():
-            self.not_finite += int(bad.sum())
-            rgb, cover = np.where(bad[:, None], 0, rgb), np.where(bad, 1, cover)
-        return rgb, cover.astype(float)
+        rgb, cover = self._scene.material.under_lights(
+            seen.uv, local, seen.view, seen.footprint, seen.curvature
+        )
+        if np.isfinite(cover).all() and np.isfinite(rgb).all():
+            return rgb, cover.astype(float)
+        bad = ~np.isfinite(cover) | ~np.isfinite(rgb).all(axis=2)
+        self.not_finite += int(bad.sum())
+        return np.where(bad[..., None], 0, rgb), np.where(np.isfinite(cover), cover, 1.0)

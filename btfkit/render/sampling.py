@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.floating]
 # The root of g³ = g + 1: multiples of 1/g and 1/g² fill the square evenly.
 _PLASTIC = 1.3247179572447460
-_STEP = np.array([1 / _PLASTIC, 1 / _PLASTIC**2])
+STEP = np.array([1 / _PLASTIC, 1 / _PLASTIC**2])
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX = (
     (np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)),
@@ -33,23 +33,25 @@ class PixelSamples:
     def __init__(self, size: tuple[int, int], samples: int, *, seed: int) -> None:
         rng = np.random.default_rng(seed)
         self.size, self.samples = size, samples
-        sequence = (0.5 + np.arange(samples)[:, None] * _STEP) % 1
+        sequence = (0.5 + np.arange(samples)[:, None] * STEP) % 1
         self._within = _tent(sequence) if samples > 1 else np.zeros((1, 2))
         # Another order, so that a place in the pixel does not go with a direction of light.
         self._lights = sequence[rng.permutation(samples)]
         self._key = rng.integers(1 << 63, size=2, dtype=np.uint64)
 
-    def places(self, pixels: NDArray[np.intp]) -> Floats:
-        """(pixels * samples, 2) columns and rows in the picture, mirrored at its borders."""
+    def places(self, pixels: NDArray[np.intp], some: range) -> Floats:
+        """(pixels * some, 2) columns and rows in the picture, mirrored at its borders."""
         h, w = self.size
         centre = np.stack([pixels % w + 0.5, pixels // w + 0.5], axis=1)
-        place = (centre[:, None] + self._within).reshape(-1, 2)
+        place = (centre[:, None] + self._within[some.start : some.stop]).reshape(-1, 2)
         place = np.abs(place)
         return np.minimum(place, 2.0 * np.array([w, h]) - place)
 
-    def lights(self, pixels: NDArray[np.intp]) -> Floats:
-        """(pixels * samples, 2) even numbers in 0..1."""
-        return ((self._lights + self._shifts(pixels)[:, None]) % 1).reshape(-1, 2)
+    def lights(self, pixels: NDArray[np.intp], some: range) -> Floats:
+        """(pixels * some, 2) even numbers in 0..1."""
+        return ((self._lights[some.start : some.stop] + self._shifts(pixels)[:, None]) % 1).reshape(
+            -1, 2
+        )
 
     def _shifts(self, pixels: NDArray[np.intp]) -> Floats:
         """(pixels, 2) even numbers in 0..1.

@@ -43,6 +43,12 @@ class Shadows:
         self.body = material.has_curvature and not isinstance(shape, Plane)
         self.asked = 0
 
+    def none_on(self, seen: Gaze) -> bool:
+        """Whether nothing of the shape can keep light from what is seen of it."""
+        if isinstance(self._shape, Plane):
+            return True
+        return self._shape.convex and not self._material.full_sphere and bool(seen.outside.all())
+
     def reached(
         self, surface: Surface, seen: Gaze, light: Floats, local: Floats, rows: Ints
     ) -> Floats:
@@ -84,15 +90,14 @@ class Shadows:
 
     def _followed(self, origin: Floats, light: Floats, beyond: Floats) -> Floats:
         """Share (m,) of light that passes every sheet on its way."""
+        if not self.holes:
+            return 1.0 - self._shape.blocks(origin, light, beyond)
         through, alive = np.ones(len(origin)), np.arange(len(origin))
         for _ in range(_MOST_SHEETS):
             met = self._shape.meet(origin[alive], light[alive], beyond[alive])
             hit = np.isfinite(met.distance)
             alive, met = alive[hit], Meeting(met.distance[hit], met.part[hit])
             if not alive.size:
-                return through
-            if not self.holes:
-                through[alive] = 0
                 return through
             through[alive] *= 1 - self._opacity(origin[alive], light[alive], met)
             beyond[alive] = met.distance + NEAR

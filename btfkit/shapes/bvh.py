@@ -80,6 +80,10 @@ class Bvh:
                 work.append((level + 1, np.concatenate([ray, ray]), children))
         return rays.distance, rays.triangle
 
+    def blocks(self, origin: Floats, direction: Floats, beyond: Floats) -> NDArray[np.bool_]:
+        """Whether each ray meets a triangle beyond."""
+        return np.isfinite(self.meet(origin, direction, beyond)[0])
+
     def _try(self, ray: Ints, leaf: Ints, rays: _Rays) -> None:
         """Note the triangles of leaves that are met before what was met so far."""
         for member in range(_LEAF):

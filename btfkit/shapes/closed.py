@@ -74,6 +74,10 @@ class Shape(ABC):
             origin, direction: (m, 3) object frame; directions are of length 1.
         """
 
+    def blocks(self, origin: Floats, direction: Floats, beyond: Floats) -> NDArray[np.bool_]:
+        """Whether each ray meets the shape farther than `beyond` (m,)."""
+        return np.isfinite(self.meet(origin, direction, beyond).distance)
+
     @abstractmethod
     def surface(self, origin: Floats, direction: Floats, met: Meeting) -> Surface:
         """The surface where rays meet it; every distance is finite."""

@@ -9,6 +9,7 @@ import importlib.util
 from typing import final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from btfkit.shapes.bvh import Bvh, Floats, Ints
 
@@ -41,11 +42,7 @@ class Embree:
     def meet(self, origin: Floats, direction: Floats, beyond: Floats) -> tuple[Floats, Ints]:
         """Distance (m,) of the first triangle beyond, inf for none, and which it is (m,)."""
         distance, triangle = np.full(len(origin), np.inf), np.zeros(len(origin), np.intp)
-        # Where the ray enters the sphere about the mesh; those that pass it meet nothing.
-        along = np.einsum("ij,ij->i", origin, direction)
-        inside = _REACH**2 - np.einsum("ij,ij->i", origin, origin) + along**2
-        alive = np.flatnonzero(inside > 0)
-        start = np.maximum(beyond[alive], -along[alive] - np.sqrt(inside[alive]))
+        alive, start = _entered(origin, direction, beyond)
         way = np.ascontiguousarray(direction[alive], np.float32)
         step = _STEP
         for _ in range(_MOST_TRIES):
@@ -65,12 +62,31 @@ class Embree:
             step *= 2
         return distance, triangle
 
+    def blocks(self, origin: Floats, direction: Floats, beyond: Floats) -> NDArray[np.bool_]:
+        """Whether each ray meets a triangle beyond."""
+        found = np.zeros(len(origin), bool)
+        alive, start = _entered(origin, direction, beyond)
+        at = (origin[alive] + start[:, None] * direction[alive]).astype(np.float32)
+        way = np.ascontiguousarray(direction[alive], np.float32)
+        # Any triangle ends the search; whether it is the one that the ray begins on is seen then.
+        some = alive[self._scene.run(at, way, query="OCCLUDED") >= 0]
+        found[some] = np.isfinite(self.meet(origin[some], direction[some], beyond[some])[0])
+        return found
+
     def _crossed(self, face: Ints, origin: Floats, direction: Floats) -> Floats:
         """Distance (m,) at which rays cross the planes of triangles; not finite if never."""
         normal = self._normal[face]
         height = np.einsum("ij,ij->i", self._first[face] - origin, normal)
         with np.errstate(divide="ignore", invalid="ignore"):
             return height / np.einsum("ij,ij->i", direction, normal)
+
+
+def _entered(origin: Floats, direction: Floats, beyond: Floats) -> tuple[Ints, Floats]:
+    """Rays that pass the sphere about the mesh, and from which distance on they are in it."""
+    along = np.einsum("ij,ij->i", origin, direction)
+    inside = _REACH**2 - np.einsum("ij,ij->i", origin, origin) + along**2
+    alive = np.flatnonzero(inside > 0)
+    return alive, np.maximum(beyond[alive], -along[alive] - np.sqrt(inside[alive]))
 
 
 def available() -> bool:

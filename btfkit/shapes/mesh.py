@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from btfkit.shapes.bvh import Ints
 from btfkit.shapes.closed import Floats, Meeting, Shape, Surface
@@ -49,6 +50,9 @@ class Mesh(Shape):
 
     def meet(self, origin: Floats, direction: Floats, beyond: Floats) -> Meeting:
         return Meeting(*self._tree.meet(origin, direction, beyond))
+
+    def blocks(self, origin: Floats, direction: Floats, beyond: Floats) -> NDArray[np.bool_]:
+        return self._tree.blocks(origin, direction, beyond)
 
     def surface(self, origin: Floats, direction: Floats, met: Meeting) -> Surface:
         face = met.part

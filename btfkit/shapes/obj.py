@@ -14,6 +14,7 @@ from array import array
 from collections.abc import Iterable, Iterator
 from itertools import groupby, islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,12 +119,12 @@ def _taken_at_once(
     return False
 
 
-def _all_numbers(text: str, kind: type, count: int) -> NDArray[np.generic] | None:
+def _all_numbers(text: str, kind: type, count: int) -> NDArray[Any] | None:
     """`count` numbers between the names of lines; None where some are no numbers."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)
         try:
-            numbers = np.fromstring(text.translate(_NAMES), kind, sep=" ")
+            numbers: NDArray[Any] = np.fromstring(text.translate(_NAMES), kind, sep=" ")
         except (DeprecationWarning, ValueError):
             return None
     return numbers if len(numbers) == count else None

@@ -75,7 +75,7 @@ def _elements(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     from plyfile import PlyData, PlyParseError
 
     # Triangles alone are read as one array; what else there is, face by face.
-    known = ({"face": dict.fromkeys(_CORNERS, 3)}, {})
+    known: tuple[dict[str, dict[str, int]], ...] = ({"face": dict.fromkeys(_CORNERS, 3)}, {})
     for lists in known:
         try:
             # An empty list makes numpy warn; whether there are numbers enough is asked below.

@@ -408,6 +408,9 @@ def test_triangles_are_found_as_by_trying_all(kind: str) -> None:
     tree = bvh.Bvh(corner) if kind == "plain" else embree.Embree(corner / scale)
     at = 1 if kind == "plain" else scale
     distance = tree.meet(origin / at, direction, beyond / at)[0] * at
+    np.testing.assert_array_equal(
+        tree.blocks(origin / at, direction, beyond / at), np.isfinite(distance)
+    )
     assert np.isfinite(expected).sum() > 100
     # Which triangle is found in float32, where in float64.
     np.testing.assert_allclose(distance, expected, atol=1e-9)
@@ -520,6 +523,67 @@ def test_frames_of_a_mesh_follow_its_texture_however_it_is_wound(tmp_path: Path)
         np.testing.assert_allclose(left, [0, 1, 0] if mirrored else [1, 0, 0], atol=1e-6)
         told = painted.all_asked("light")[-1]
         np.testing.assert_allclose(told, light * ([-1, 1, 1] if mirrored else 1), atol=1e-6)
+
+
+# --- panels, passes, and many lights
+
+
+def test_a_panel_far_away_is_a_distant_light() -> None:
+    from btfkit.render.area import AreaLight
+
+    way = towards(40, 30)
+    for shape in ("sphere", "torus"):
+        form = shape_of(shape)
+        far = Scene(Painted(white()), form, np.zeros((0, 3)), panels=[AreaLight(way, (1, 1), 3000)])
+        seen = render(far, size=(24, 24), samples=4).radiance
+        plain = pictured(Painted(white()), form, way, size=(24, 24), samples=4).radiance
+        # Half a unit beside the way at 3000 turns light by 2e-4, and falls off by 1/3000.
+        shown = np.abs(seen - plain)
+        assert np.quantile(shown, 0.98) < 2e-3
+
+
+def test_a_panel_lights_a_plane_as_its_form_factor_says() -> None:
+    from btfkit.render.area import AreaLight
+
+    panel = AreaLight(ABOVE, (2.0, 2.0), 1.5)
+    scene = Scene(Painted(white()), shape_of("plane"), np.zeros((0, 3)), panels=[panel])
+    seen = render(scene, size=(9, 9), samples=256).radiance[..., 0]
+    even = (np.arange(200) + 0.5) / 200 * 2 - 1
+    x, y = np.meshgrid(even, even)
+
+    def factor(px: float, py: float) -> float:
+        square = (x - px) ** 2 + (y - py) ** 2 + 1.5**2
+        return float((1.5**2 / square**2).mean())
+
+    # A pixel's tent spreads 2/9; the sum over 256 places is good to a percent.
+    assert seen[4, 4] == pytest.approx(1, rel=0.02)
+    assert seen[4, 8] == pytest.approx(factor(8 / 9, 0) / factor(0, 0), rel=0.03)
+
+
+def test_passes_change_no_picture_and_time_ends_them() -> None:
+    scene = Scene(Painted(corners()), shape_of("torus"), towards(50, 20)[None])
+    whole = render(scene, size=(16, 16), samples=4)
+    passes = render(scene, size=(16, 16), samples=4, within_s=1e9)
+    # The same rays, added in another order.
+    np.testing.assert_allclose(passes.radiance, whole.radiance, atol=1e-6)
+    assert (whole.samples, passes.samples) == (4, 4)
+    short = render(scene, size=(16, 16), samples=4096, within_s=1e-9)
+    assert short.samples == 1
+    assert short.cover.max() == 1
+
+
+def test_an_interruption_keeps_the_passes_that_were_finished() -> None:
+    scene = Scene(Painted(white()), shape_of("sphere"), ABOVE[None])
+
+    def stop(done: int, total: int) -> None:
+        if done > total / 2:
+            raise KeyboardInterrupt
+
+    kept = render(scene, size=(8, 8), samples=16, progress=stop)
+    assert kept.interrupted
+    assert kept.samples == 8
+    with pytest.raises(KeyboardInterrupt):
+        render(scene, size=(8, 8), samples=1, progress=stop)
 
 
 # --- holes
@@ -937,5 +1001,6 @@ def test_progress_reaches_the_whole_picture() -> None:
     told: list[tuple[int, int]] = []
     note: Callable[[int, int], None] = lambda done, total: told.append((done, total))  # noqa: E731
     pictured(Painted(white()), "plane", size=(64, 128), samples=64, progress=note)
-    assert told[-1] == (8192, 8192)
+    # Rays: 64 for each of 8192 pixels.
+    assert told[-1] == (64 * 8192, 64 * 8192)
     assert len(told) > 1

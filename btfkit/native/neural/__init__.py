@@ -10,6 +10,8 @@ from btfkit import native
 from btfkit.native.neural.layout import CHANNELS, Array, Layout, Network, Networks
 
 Loss = Literal["square", "absolute"]
+# Which lights queries have, as the extension counts it.
+_OWN, _SHARED, _EACH = range(3)
 
 
 @final
@@ -65,7 +67,7 @@ class Kernel:
         outputs = self._layout.decoder.widths[-1] if raw else self._layout.channels
         rgb = np.empty((len(uv), outputs), np.float32)
         parts = (weights, texels, uv, light, view, footprint, curvature, rgb, opacity)
-        self._model.evaluate(*parts, False, raw, self._threads, self._variant)
+        self._model.evaluate(*parts, _OWN, raw, self._threads, self._variant)
         return rgb
 
     def evaluate_lights(
@@ -80,13 +82,18 @@ class Kernel:
         *,
         opacity: Array | None = None,
     ) -> Array:
-        """(m, b, c) reflectance of b views under m lights (m, 3) that all of them share.
+        """(m, b, c) reflectance of b views under m lights.
 
         What does not depend on the light is computed once a view; `opacity` as in `evaluate`.
+
+        Args:
+            lights: (m, 3) that all views share, or (m, b, 3) of each view; there a vector of zeros
+                is not asked, and answers 0.
         """
         rgb = np.empty((len(lights), len(uv), self._layout.channels), np.float32)
         parts = (weights, texels, uv, lights, view, footprint, curvature, rgb, opacity)
-        self._model.evaluate(*parts, True, False, self._threads, self._variant)
+        kind = _SHARED if lights.ndim == 2 else _EACH
+        self._model.evaluate(*parts, kind, False, self._threads, self._variant)
         return rgb
 
     def depths(

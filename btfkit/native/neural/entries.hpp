@@ -4,11 +4,12 @@ inline int next_size(int64_t at, int64_t to) {
     return int(std::max<int64_t>(std::min<int64_t>(kTile, to - at - kTile), 0));
 }
 
-// rgb (lights or 1, size, outputs) for queries [from, to); lights: directions shared by all;
-// opacity (size) of curved heights, or null.
+// rgb (lights or 1, size, outputs) for queries [from, to); lights: directions (count) shared by all,
+// or `each` of them (count, size), where a vector of zeros is not asked and answers 0; opacity
+// (size) of curved heights, or null.
 NEUMIP_TARGET void evaluate(const Plan& plan, const float* weights, const float* texels,
-                            const Batch& b, const float* lights, int64_t count, int64_t from,
-                            int64_t to, float* rgb, float* opacity, bool raw) {
+                            const Batch& b, const float* lights, int64_t count, bool each,
+                            int64_t from, int64_t to, float* rgb, float* opacity, bool raw) {
     auto tile = std::make_unique<Tile>(plan, weights, texels, b, false);
     const int64_t outputs = raw ? plan.decoder.widths.back() : plan.channels;
     for (int64_t at = from; at < to; at += kTile) {
@@ -25,8 +26,21 @@ NEUMIP_TARGET void evaluate(const Plan& plan, const float* weights, const float*
             tile->stage_two(b.light + 3 * at, false, valid, rgb + at * outputs, raw);
             continue;
         }
-        for (int64_t j = 0; j < count; ++j)
-            tile->stage_two(lights + 3 * j, true, valid, rgb + (j * b.size + at) * outputs, raw);
+        for (int64_t j = 0; j < count; ++j) {
+            float* out = rgb + (j * b.size + at) * outputs;
+            if (!each) {
+                tile->stage_two(lights + 3 * j, true, valid, out, raw);
+                continue;
+            }
+            const float* own = lights + 3 * (j * b.size + at);
+            const auto asked = [&](int i) { return own[3 * i] != 0 || own[3 * i + 1] != 0 || own[3 * i + 2] != 0; };
+            int some = 0;
+            for (int i = 0; i < valid; ++i) some += asked(i);
+            if (some) tile->stage_two(own, false, valid, out, raw);
+            if (some == valid) continue;
+            for (int i = 0; i < valid; ++i)
+                if (!asked(i)) std::fill_n(out + i * outputs, outputs, 0.f);
+        }
     }
 }
 

@@ -60,6 +60,9 @@ using namespace neumip;
 
 namespace {
 
+// Which lights queries have: one each, all of them the same, or several each.
+enum Lit { kOwn, kShared, kEach };
+
 struct Variant {
     const char* name;
     decltype(&baseline::evaluate) evaluate;
@@ -181,12 +184,15 @@ class Model {
 
     void evaluate(In<float> w, In<float> t, In<float> uv, In<float> light, In<float> view,
                   nb::object footprint, nb::object curvature, Out<float> rgb, nb::object opacity,
-                  bool shared, bool raw, int threads, const std::string& name) const {
+                  int lit, bool raw, int threads, const std::string& name) const {
         Batch b = batch(w, t, uv, view, footprint, curvature);
         const int64_t outputs = raw ? plan_.decoder.widths.back() : plan_.channels;
-        const int64_t lights = int64_t(light.size()) / 3;
-        require(shared || lights == b.size, "one light a query");
-        require(int64_t(rgb.size()) == (shared ? lights : 1) * b.size * outputs, "size of rgb");
+        // One light a query, lights that all share, or several of each query's own.
+        const bool shared = lit == kShared, each = lit == kEach;
+        const int64_t all_lights = int64_t(light.size()) / 3;
+        const int64_t lights = each ? all_lights / std::max<int64_t>(b.size, 1) : all_lights;
+        require(shared || (each ? lights : 1) * b.size == all_lights, "one light a query");
+        require(int64_t(rgb.size()) == (shared || each ? lights : 1) * b.size * outputs, "size of rgb");
         b.light = light.data();
         const auto v = variant(name);
         float *out = rgb.data(), *cover = nullptr;
@@ -196,10 +202,10 @@ class Model {
             require(int64_t(array.size()) == b.size, "one opacity a query");
             cover = array.data();
         }
-        const float* all = shared ? light.data() : nullptr;
+        const float* all = shared || each ? light.data() : nullptr;
         nb::gil_scoped_release release;
         spread(b.size, kGrain, useful(b.size, threads), [&](int, int64_t from, int64_t to) {
-            v.evaluate(plan_, w.data(), t.data(), b, all, lights, from, to, out, cover, raw);
+            v.evaluate(plan_, w.data(), t.data(), b, all, lights, each, from, to, out, cover, raw);
         });
     }
 
