@@ -38,6 +38,7 @@ def _next(target: str, out: Path) -> str:
     folder = shlex.quote(str(out))
     return {
         "mitsuba": f"python {folder}/render.py",
+        "maps": f"open {folder}/material.mtlx in a program that reads MaterialX",
         "npz": f"python {folder}/evaluate.py queries.npz answers.npz",
         "cpp": f"cd {folder} && c++ -O3 -std=c++17 example.cpp -o example && ./example",
         "glsl": f"open {folder}/example.html in a browser",
