@@ -4,6 +4,7 @@ from __future__ import annotations
 
 # Target -> function (material, program, folder) that writes it.
 TARGETS: dict[str, str] = {
+    "blender": "btfkit.export.blender:write",
     "mitsuba": "btfkit.export.mitsuba:write",
     "maps": "btfkit.export.maps:write",
     "npz": "btfkit.export.npz:write",
@@ -16,4 +17,4 @@ TARGETS: dict[str, str] = {
     "slang": "btfkit.export.slang:write",
 }
 # Those that ask the material itself, whatever its program is made of.
-ASKED: tuple[str, ...] = ("mitsuba", "maps")
+ASKED: tuple[str, ...] = ("blender", "mitsuba", "maps")

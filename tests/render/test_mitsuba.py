@@ -15,7 +15,8 @@ import pytest
 from cases import directions, made
 
 from btfkit.export.package import export
-from btfkit.io import images, store
+from btfkit.io import images
+from btfkit.io.store import writer
 from btfkit.materials.base import Header
 from btfkit.materials.file import save
 from btfkit.materials.lambert import Lambert, LambertSpec
@@ -234,13 +235,15 @@ def dr_repeat(mi: Any, si: Any, count: int, *, index: int) -> Any:
 
 
 def test_a_btf_answers_as_its_interpolation(mi: Any, tmp_path: Path) -> None:
+    import drjit
+
     btf = synth_btf("cobbles", size=8, lights="9", views="7", samples=1)
     btf = replace(btf, textures=btf.textures.batch(range(len(btf))))
-    store.write(btf, tmp_path / "c.btf.zarr")
+    writer.write(btf, tmp_path / "c.btf.zarr")
     bsdf = mi.load_dict({"type": "btfkit_measured", "filename": str(tmp_path / "c.btf.zarr")})
     rng, n = np.random.default_rng(2), 500
     uv, light, view = rng.random((n, 2)), directions(rng, n), directions(rng, n)
-    si = mi.SurfaceInteraction3f()
+    si = drjit.zeros(mi.SurfaceInteraction3f, n)
     si.uv = mi.Point2f(*[x.astype(np.float32) for x in (uv[:, 0], 1 - uv[:, 1])])
     si.wi = mi.Vector3f(*view.T)
     found = np.pi * np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*light.T))).T
@@ -248,7 +251,7 @@ def test_a_btf_answers_as_its_interpolation(mi: Any, tmp_path: Path) -> None:
     # The store holds halves; weights of triangles are float32.
     np.testing.assert_allclose(found, wanted, rtol=3e-3, atol=1e-3)
     scattered = btf.subset(rng.permutation(len(btf))[:20])
-    store.write(scattered, tmp_path / "s.btf.zarr")
+    writer.write(scattered, tmp_path / "s.btf.zarr")
     with pytest.raises(Exception, match="expected every view under every light"):
         mi.load_dict({"type": "btfkit_measured", "filename": str(tmp_path / "s.btf.zarr")})
 
@@ -263,7 +266,7 @@ def test_gradients_reach_the_textures(mi: Any, tmp_path: Path) -> None:
     dr.enable_grad(texels)
     told[name] = texels
     told.update()
-    si = mi.SurfaceInteraction3f()
+    si = dr.zeros(mi.SurfaceInteraction3f, 2)
     si.uv, si.wi = mi.Point2f([0.3, 0.7], [0.6, 0.2]), mi.Vector3f([0.6, 0.0], 0, [0.8, 1.0])
     ctx, light = mi.BSDFContext(), mi.Vector3f(0, 0.6, 0.8)
 
@@ -298,7 +301,8 @@ def test_a_relief_traced_by_mitsuba_answers_as_our_tracer(mi: Any) -> None:
     # Finer than texels, since a bilinear cell is not two triangles.
     place = (np.arange(n * fine + 1) / fine) / n
     v, u = np.meshgrid(place, place, indexing="ij")
-    height = sampled(flat.height, v * n - 0.5, u * n - 0.5, wrap=True)
+    row, col = (place.reshape(-1) * n - 0.5 for place in (v, u))
+    height = sampled(flat.height, row, col, wrap=True).reshape(u.shape)
     at = np.stack([u, 1 - v, height], axis=-1).reshape(-1, 3)
     m = n * fine + 1
     index = np.arange(m * m).reshape(m, m)
@@ -371,7 +375,7 @@ def test_the_exported_scene_is_rendered_by_its_own_program(tmp_path: Path) -> No
         pytest.skip(amiss)
     export(made("lambert"), "mitsuba", tmp_path / "out")
     subprocess.run([sys.executable, tmp_path / "out" / "render.py", "4"], check=True)
-    picture = images.decode("r", (tmp_path / "out" / "render.exr").read_bytes(), transfer="linear")
+    picture = images.decode("render.exr", (tmp_path / "out" / "render.exr").read_bytes(), transfer="linear")
     assert picture.linear.shape[:2] == (240, 320)
     # The ball before the sky, and a floor that is lit.
     middle, sky = picture.linear[100:140, 140:180], picture.linear[:20]
