@@ -37,7 +37,11 @@ def _next(target: str, out: Path) -> str:
     """How the example of an export is run."""
     folder = shlex.quote(str(out))
     return {
+        "blender": f"blender {folder}/material.blend"
+        if (out / "material.blend").is_file()
+        else f"blender -b -P {folder}/make_blend.py",
         "mitsuba": f"python {folder}/render.py",
+        "maps": f"open {folder}/material.mtlx in a program that reads MaterialX",
         "npz": f"python {folder}/evaluate.py queries.npz answers.npz",
         "cpp": f"cd {folder} && c++ -O3 -std=c++17 example.cpp -o example && ./example",
         "glsl": f"open {folder}/example.html in a browser",

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 # Target -> function (material, program, folder) that writes it.
 TARGETS: dict[str, str] = {
+    "blender": "btfkit.export.blender:write",
     "mitsuba": "btfkit.export.mitsuba:write",
+    "maps": "btfkit.export.maps:write",
     "npz": "btfkit.export.npz:write",
     "cpp": "btfkit.export.cpp:write",
     "glsl": "btfkit.export.glsl:write",
@@ -15,4 +17,4 @@ TARGETS: dict[str, str] = {
     "slang": "btfkit.export.slang:write",
 }
 # Those that ask the material itself, whatever its program is made of.
-ASKED: tuple[str, ...] = ("mitsuba",)
+ASKED: tuple[str, ...] = ("blender", "mitsuba", "maps")

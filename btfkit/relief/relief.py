@@ -79,7 +79,8 @@ class Relief:
                 raise ValueError(f"{name} ranges {value.min():g}..{value.max():g}; expected 0..1")
         for name in ("roughness", "roughness_across"):
             value = getattr(self, name)
-            if value is not None and (value.min() < 0.02 or value.max() > 1):
+            # As float32 has it: numpy before 2 would compare in float64.
+            if value is not None and (value.min() < np.float32(0.02) or value.max() > 1):
                 raise ValueError(
                     f"{name} ranges {value.min():g}..{value.max():g}; expected 0.02..1"
                 )

@@ -6,6 +6,7 @@ import importlib.util
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,20 @@ import numpy as np
 import pytest
 from cases import directions, made
 
+from btfkit.export.package import export
+from btfkit.io import images
+from btfkit.io.store import writer
 from btfkit.materials.base import Header
 from btfkit.materials.file import save
 from btfkit.materials.lambert import Lambert, LambertSpec
+from btfkit.materials.lobes import LobeTable
+from btfkit.materials.measured.interpolation import Interpolation
+from btfkit.materials.neumip.spec import NeuMIPSpec
+from btfkit.materials.sbtf.material import SBTF
+from btfkit.relief.procedural import make
+from btfkit.relief.stack import sampled
+from btfkit.relief.synth import synth_btf
+from btfkit.relief.trace import answer
 from btfkit.render.preview import Scene, render
 from btfkit.render.variants import usable
 from btfkit.shapes.catalogue import shape_of
@@ -119,15 +131,208 @@ def test_a_white_surface_in_white_surroundings_is_white(mi: Any, tmp_path: Path)
     assert np.array(picture).mean() == pytest.approx(1, abs=0.01)
 
 
+def with_sharp_lobes(name: str) -> Any:
+    """A material of random numbers that draws from sharp, tilted lobes."""
+    finest = np.tile(np.float32([0.4, -0.2, 0.15, 0.7, 0.3]), (6, 9, 1))
+    material = made(name)
+    return material.with_lobes(LobeTable.of(finest, grid=material.header.grid, wrap="wrap"))
+
+
+def bumpy(**options: Any) -> SBTF:
+    """An SBTF of random weights over round bumps."""
+    spec = NeuMIPSpec((16, 24), levels=1, features=4, heights=True, curved=True, hidden=(8,),
+                      directions=("lx", "ly", "lz", "vx", "vy", "vz", "curvature"))  # fmt: skip
+    header = Header((16, 24))
+    rng = np.random.default_rng(0)
+    weights = {n: rng.normal(0, 0.4, s).astype(np.float32)
+               for n, s in SBTF.shapes(spec, header).items()}  # fmt: skip
+    row, col = np.mgrid[:16, :24]
+    bumps = np.sin(2 * np.pi * col / 24) * np.sin(2 * np.pi * row / 16) - 1
+    weights["texture.heights"] = (bumps[..., None]).astype(np.float32)
+    return SBTF(spec, weights, header)
+
+
 def test_samples_are_as_dense_as_they_say(mi: Any, tmp_path: Path) -> None:
-    plugin(mi, "lambert", tmp_path)
-    xml = f'<string name="filename" value="{tmp_path}/lambert.safetensors"/>'
+    save(with_sharp_lobes("neumip"), tmp_path / "sharp.safetensors", lobes=True)
+    xml = f'<string name="filename" value="{tmp_path}/sharp.safetensors"/>'
     sample, pdf = mi.chi2.BSDFAdapter("btfkit", xml)
     test = mi.chi2.ChiSquareTest(
         domain=mi.chi2.SphericalDomain(), sample_func=sample, pdf_func=pdf, sample_dim=3,
-        sample_count=200_000, res=41,
+        sample_count=200_000, res=61,
     )  # fmt: skip
     assert test.run()
+
+
+def test_lobes_are_those_of_the_material(mi: Any) -> None:
+    from btfkit.render.mitsuba import lobes
+
+    material, rng, n = with_sharp_lobes("lambert"), np.random.default_rng(3), 500
+    uv, view, light = rng.random((n, 2)), directions(rng, n), directions(rng, n)
+    footprint = rng.choice([0.5, 3, 100], n)
+    parts = [mi.Vector3f(*part.T.astype(np.float32)) for part in (view, light)]
+    place = [mi.Float(x.astype(np.float32)) for x in uv.T]
+    lobe = lobes.Lobes(material.lobes)(place, parts[0], mi.Float(footprint), mi.Bool(True))
+    found = np.array(lobes.pdf(lobe, parts[1], parts[0]))
+    wanted = material.pdf(uv, light, view, footprint)
+    # float32 half vectors of grazing pairs, through a lobe of alpha 0.15 to the fourth power
+    np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=1e-6)
+
+
+def test_bent_rays_answer_as_the_material(mi: Any) -> None:
+    from btfkit.render.mitsuba.evaluation import Evaluation
+
+    material, rng, n = bumpy(), np.random.default_rng(1), 1000
+    uv = rng.random((n, 2), np.float32)
+    light, view = directions(rng, n), directions(rng, n)
+    curvature = rng.choice([0, 0.5, 3, -2], n).astype(np.float32)
+    parts = [[mi.Float(x.copy()) for x in part.T] for part in (uv, light, view)]
+    found, cover = Evaluation(material.program())(
+        *parts, mi.Float(0.5), mi.Bool(True), mi.Float(curvature)
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        wanted = material.evaluate(uv, light, view, 0.5, curvature)
+    assert 0.05 < np.mean(wanted.opacity == 0) < 0.95
+    same = np.array(cover) == wanted.opacity
+    # A ray that just touches is met or not by a rounding.
+    assert same.mean() > 0.995
+    error = np.abs(np.stack([np.array(x) for x in found], axis=1) - wanted.reflectance)[same]
+    assert np.quantile(error, 0.995) < 1e-4
+
+
+def test_a_body_is_seen_through_where_its_silhouette_ends(mi: Any, tmp_path: Path) -> None:
+    """Curvature from the mesh, null lobes, and volpath: the ball is smaller than its surface."""
+    export(bumpy(), "mitsuba", tmp_path / "out")
+    described = (tmp_path / "out" / "scene.xml").read_text()
+    assert 'type="volpath"' in described
+    scene = mi.load_file(str(tmp_path / "out" / "scene.xml"))
+    ball = next(shape for shape in scene.shapes() if shape.has_attribute("vertex_curvature"))
+    at = np.linspace(0.8, 0.999, 64, dtype=np.float32)
+    ray = mi.Ray3f(mi.Point3f(mi.Float(at), 0.1, 5), mi.Vector3f(0, 0, -1))
+    si = scene.ray_intersect(ray)
+    through = np.array(si.bsdf().eval_null_transmission(si, si.is_valid()))[0]
+    assert set(np.unique(through)) <= {0, 1}
+    assert through[at > 0.99].mean() > through[at < 0.85].mean()
+    bsdf, ctx, n = ball.bsdf(), mi.BSDFContext(), 2000
+    rng = np.random.default_rng(0)
+    seen = dr_repeat(mi, si, n, index=40)
+    drawn, weight = bsdf.sample(ctx, seen, mi.Float(rng.random(n)), mi.Point2f(*rng.random((2, n))))
+    null = np.array(drawn.sampled_component) == 1
+    assert null.all() if through[40] else not null.any()
+    if not through[40]:
+        value, pdf = bsdf.eval_pdf(ctx, seen, drawn.wo)
+        np.testing.assert_allclose(np.array(drawn.pdf), np.array(pdf), rtol=1e-4)
+        np.testing.assert_allclose(
+            np.array(weight) * np.array(pdf), np.array(value), rtol=1e-3, atol=1e-5
+        )
+
+
+def dr_repeat(mi: Any, si: Any, count: int, *, index: int) -> Any:
+    """One lane of a surface interaction, many times."""
+    import drjit
+
+    return drjit.gather(mi.SurfaceInteraction3f, si, drjit.full(mi.UInt32, index, count))
+
+
+def test_a_btf_answers_as_its_interpolation(mi: Any, tmp_path: Path) -> None:
+    import drjit
+
+    btf = synth_btf("cobbles", size=8, lights="9", views="7", samples=1)
+    btf = replace(btf, textures=btf.textures.batch(range(len(btf))))
+    writer.write(btf, tmp_path / "c.btf.zarr")
+    bsdf = mi.load_dict({"type": "btfkit_measured", "filename": str(tmp_path / "c.btf.zarr")})
+    rng, n = np.random.default_rng(2), 500
+    uv, light, view = rng.random((n, 2)), directions(rng, n), directions(rng, n)
+    si = drjit.zeros(mi.SurfaceInteraction3f, n)
+    si.uv = mi.Point2f(*[x.astype(np.float32) for x in (uv[:, 0], 1 - uv[:, 1])])
+    si.wi = mi.Vector3f(*view.T)
+    found = np.pi * np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*light.T))).T
+    wanted = Interpolation.of(btf).evaluate(uv, light, view).reflectance
+    # The store holds halves; weights of triangles are float32.
+    np.testing.assert_allclose(found, wanted, rtol=3e-3, atol=1e-3)
+    scattered = btf.subset(rng.permutation(len(btf))[:20])
+    writer.write(scattered, tmp_path / "s.btf.zarr")
+    with pytest.raises(Exception, match="expected every view under every light"):
+        mi.load_dict({"type": "btfkit_measured", "filename": str(tmp_path / "s.btf.zarr")})
+
+
+def test_gradients_reach_the_textures(mi: Any, tmp_path: Path) -> None:
+    import drjit as dr
+
+    bsdf = plugin(mi, "neumip", tmp_path)
+    told = mi.traverse(bsdf)
+    name = next(name for name in told.keys() if "features" in name)  # noqa: SIM118
+    texels = told[name]
+    dr.enable_grad(texels)
+    told[name] = texels
+    told.update()
+    si = dr.zeros(mi.SurfaceInteraction3f, 2)
+    si.uv, si.wi = mi.Point2f([0.3, 0.7], [0.6, 0.2]), mi.Vector3f([0.6, 0.0], 0, [0.8, 1.0])
+    ctx, light = mi.BSDFContext(), mi.Vector3f(0, 0.6, 0.8)
+
+    def total() -> Any:
+        return dr.sum(bsdf.eval(ctx, si, light), axis=None)
+
+    dr.backward(total())
+    slope = np.array(dr.grad(texels))
+    assert 0 < np.count_nonzero(slope) < slope.size
+    where, step = int(np.argmax(np.abs(slope))), 1e-2
+    values = np.array(dr.detach(texels))
+    ends = []
+    for sign in (1, -1):
+        moved = values.copy()
+        moved[where] += sign * step
+        told[name] = mi.Float(moved)
+        told.update()
+        ends.append(float(np.array(total()).item()))
+    # A central difference through ReLUs.
+    assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(slope[where], rel=0.05)
+
+
+def test_a_relief_traced_by_mitsuba_answers_as_our_tracer(mi: Any) -> None:
+    """Instances of one tile, no shared code: who is lit, who is hidden, and how bright."""
+    from btfkit.render.mitsuba.meshes import heightfield
+
+    relief = make("cobbles", 32, relief_texels=4.0)
+    flat = replace(
+        relief, specular=np.zeros_like(relief.specular), albedo=np.full_like(relief.albedo, 0.5)
+    )
+    n, fine = 32, 4
+    # Finer than texels, since a bilinear cell is not two triangles.
+    place = (np.arange(n * fine + 1) / fine) / n
+    v, u = np.meshgrid(place, place, indexing="ij")
+    row, col = (place.reshape(-1) * n - 0.5 for place in (v, u))
+    height = sampled(flat.height, row, col, wrap=True).reshape(u.shape)
+    at = np.stack([u, 1 - v, height], axis=-1).reshape(-1, 3)
+    m = n * fine + 1
+    index = np.arange(m * m).reshape(m, m)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    faces = np.stack([np.stack([a, c, b], -1), np.stack([b, c, d], -1)], axis=2).reshape(-1, 3)
+    bsdf = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}})
+    tile = heightfield(at, np.stack([u, 1 - v], -1).reshape(-1, 2), faces, bsdf)
+    group = mi.load_dict({"type": "shapegroup", "tile": tile})
+    shift = mi.ScalarTransform4f().translate
+    scene = mi.load_dict({"type": "scene"} | {
+        f"i{x}{y}": {"type": "instance", "group": group, "to_world": shift([x, y, 0])}
+        for x in range(-2, 3) for y in range(-2, 3)
+    })  # fmt: skip
+    rng, count = np.random.default_rng(4), 4000
+    uv = rng.random((count, 2)).astype(np.float32)
+    light, view = directions(rng, count, 0.4), directions(rng, count, 0.4)
+    x, y = uv[:, 0], 1 - uv[:, 1]
+    origin = np.stack([x, y, np.zeros(count)], axis=1) + 1.2 * view
+    si = scene.ray_intersect(
+        mi.Ray3f(mi.Point3f(*origin.T.astype(np.float32)), mi.Vector3f(*-view.T))
+    )
+    shadow = np.array(scene.ray_test(si.spawn_ray(mi.Vector3f(*light.T))))
+    normal = np.array(si.n).T
+    lit = np.maximum((normal * light).sum(axis=1), 0) * ~shadow * 0.5
+    ours = answer(flat, uv, light, view, 0.0, samples=1).reflectance[:, 0]
+    assert np.array(si.is_valid()).all()
+    error = np.abs(ours - lit)
+    # Facets a quarter of a texel wide stand for bilinear cells; at edges of shadows all or nothing.
+    assert np.median(error) < 0.01
+    assert np.mean(error > 0.1) < 0.04
 
 
 def test_networks_that_would_be_compiled_for_minutes_are_refused(mi: Any) -> None:
@@ -162,3 +367,19 @@ def test_without_a_variant_the_plugin_says_what_to_do() -> None:
     )  # fmt: skip
     assert "no variant of Mitsuba is set; mitsuba.set_variant" in done.stderr
     assert "nonsense does not run here" in str(usable("nonsense"))
+
+
+def test_the_exported_scene_is_rendered_by_its_own_program(tmp_path: Path) -> None:
+    amiss = usable(VARIANT)
+    if amiss:
+        pytest.skip(amiss)
+    export(made("lambert"), "mitsuba", tmp_path / "out")
+    subprocess.run([sys.executable, tmp_path / "out" / "render.py", "4"], check=True)
+    picture = images.decode("render.exr", (tmp_path / "out" / "render.exr").read_bytes(), transfer="linear")
+    assert picture.linear.shape[:2] == (240, 320)
+    # The ball before the sky, and a floor that is lit.
+    middle, sky = picture.linear[100:140, 140:180], picture.linear[:20]
+    np.testing.assert_allclose(sky, 0.35, atol=1e-3)
+    assert 0.05 < middle.mean() < 2
+    assert middle.std() > 0.02
+    assert not (tmp_path / "out" / "render.png").stat().st_size < 1000

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import PurePosixPath
 
 from btfkit.io.images import codes, exr, radiance
-from btfkit.io.images.encoding import encode_jpeg, encode_png, write_exr
+from btfkit.io.images.encoding import encode_jpeg, encode_png, encode_png_numbers, write_exr
 from btfkit.io.images.exr import exr_channels, read_exr
 from btfkit.io.images.image import Array, Image
 
 __all__ = [
-    "SUFFIXES", "Image", "decode", "encode_jpeg", "encode_png", "exr_channels", "is_image", "read",
-    "read_exr", "write_exr",
+    "SUFFIXES", "Image", "decode", "encode_jpeg", "encode_png", "encode_png_numbers",
+    "exr_channels", "is_image", "read", "read_exr", "write_exr",
 ]  # fmt: skip
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr", ".bmp"}
 

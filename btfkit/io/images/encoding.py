@@ -34,6 +34,13 @@ def encode_png(linear: Array) -> bytes:
     return _encoded(cv2.imencode(".png", _codes(linear)))
 
 
+def encode_png_numbers(values: Array) -> bytes:
+    """16-bit PNG bytes of numbers (h, w, 1 or 3) from 0 to 1 that are no colours."""
+    cv2 = opencv()
+    codes = np.rint(np.clip(values, 0, 1) * 65535).astype(np.uint16)
+    return _encoded(cv2.imencode(".png", codes[..., ::-1] if codes.shape[2] == 3 else codes))
+
+
 def png_with_profile(data: bytes, profile: bytes) -> bytes:
     """A PNG with an ICC profile behind its header."""
     body = b"iCCPICC profile\0\0" + zlib.compress(profile)
