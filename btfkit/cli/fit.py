@@ -49,6 +49,10 @@ btfkit fit *.btf.zarr --model neumip --cluster tcp://host:8786 -o models""",
 )
 @click.argument("sources", metavar="[SOURCE]", nargs=-1, type=LocationType())
 @click.option("--model", default="auto", show_default=True, help="Name of a model, or auto.")
+@click.option(
+    "--from", "teacher", type=click.Path(path_type=Path),
+    help="A fitted model that teaches --model student; SOURCE may be left out then.",
+)  # fmt: skip
 @out_option("The model file; by default SOURCE.MODEL.safetensors here; of several, their folder")
 @click.option(
     "--budget",
@@ -82,6 +86,7 @@ def fit_verb(
     *,
     sources: tuple[Location, ...],
     model: str,
+    teacher: Path | None,
     out: Path | None,
     budget: float,
     steps: int | None,
@@ -100,11 +105,12 @@ def fit_verb(
     SOURCE: a native store, anything `btfkit ingest` reads, a relief file or a query file.
     Writes the model and OUT.report.json beside it. Ctrl-C keeps the best state so far.
     With --cluster, several: a task a material; one that fails is named at the end.
+    `--model student --from MODEL` fits a small model to a large one's answers.
     """
     from btfkit.errors import unknown
     from btfkit.fitting import MODELS
     from btfkit.fitting.fit import fit
-    from btfkit.sources import measured
+    from btfkit.sources import material, measured
 
     if model != "auto" and model not in MODELS:
         raise ValueError(unknown("model", model, ["auto", *MODELS]))
@@ -116,19 +122,33 @@ def fit_verb(
     def named(source: Location) -> Path:
         return Path(f"{stem(source)}.{model}.safetensors")
 
+    if cluster and teacher is not None:
+        raise ValueError("--from teaches one student, and --cluster fits many: leave out one")
     if cluster:
         targets = outputs(sources, out, named)
         return _on_cluster(cluster, targets, asked, preview, resume=resume, force=force, bar=bar)
     bar.phase("reading")
-    path = the_one(sources, "sources") or the_only(
-        Path().glob("*.btf.zarr"),
-        what="stores",
-        remedy="name one: btfkit fit STORE",
-        first="btfkit ingest FOLDER, or name a SOURCE",
-    )
+    path = the_one(sources, "sources")
+    if path is None and teacher is None:
+        path = the_only(
+            Path().glob("*.btf.zarr"),
+            what="stores",
+            remedy="name one: btfkit fit STORE",
+            first="btfkit ingest FOLDER, or name a SOURCE",
+        )
+    taught = None if teacher is None else material(teacher)
+    if path is not None:
+        default = named(path)
+    else:
+        assert teacher is not None
+        assert taught is not None
+        # wool.neumip.safetensors teaches wool.student.safetensors.
+        own = stem(teacher).removesuffix(f".{taught.model}")
+        default = Path(f"{own}.{model}.safetensors")
     report = fit(
-        measured(path),
-        out=out or named(path),
+        None if path is None else measured(path),
+        teacher=taught,
+        out=out or default,
         resume=resume,
         progress=bar,
         phase=bar.phase,

@@ -15,10 +15,11 @@ from btfkit.export import ASKED, TARGETS, blender
 from btfkit.export.arrays import refuse_unknown
 from btfkit.files import whole_folder
 from btfkit.materials.base import Material
+from btfkit.materials.lobes.table import COLUMNS
 from btfkit.program import Program
 from btfkit.render import studio
 
-PREVIEW = "preview.png"
+PREVIEW, LOBES = "preview.png", "lobes.bin"
 
 
 def export(
@@ -51,6 +52,8 @@ def export(
     said = {"target": target, **about(material)}
     with whole_folder(out, force=force) as folder:
         write(material, program, folder)
+        if target not in ASKED:
+            said["lobes"] = _lobes(material, folder)
         (folder / "about.json").write_text(json.dumps(jsonvalues.plain(said), indent=1) + "\n")
         (folder / PREVIEW).write_bytes(studio.picture(material))
     if target == "blender":
@@ -59,6 +62,19 @@ def export(
     files = {str(path.relative_to(out)): path.stat().st_size
              for path in sorted(Path(out).rglob("*")) if path.is_file()}  # fmt: skip
     return {**said, "files": files, "bytes": sum(files.values())}
+
+
+def _lobes(material: Material, folder: Path) -> dict[str, Any]:
+    """Writes the lobes that lights are drawn from, and says how they lie in their file."""
+    finest = material.lobes.levels[0]
+    h, w, _ = finest.shape
+    (folder / LOBES).write_bytes(finest.astype("<f2").tobytes())
+    return {
+        "file": LOBES,
+        "size": [w, h],
+        "columns": list(COLUMNS),
+        "numbers": "float16, little-endian, cell by cell, row by row, v = 0 first",
+    }
 
 
 def about(material: Material) -> dict[str, Any]:

@@ -16,7 +16,10 @@ TRAINED: dict[str, str] = {
     "sbtf-paper": "btfkit.fitting.sbtf.paper:SBTFPaper",
     "neubtf": "btfkit.fitting.neubtf.trainable:NeuBTF",
     "neubtf-paper": "btfkit.fitting.neubtf.paper:NeuBTFPaper",
+    "student": "btfkit.fitting.student.trainable:Student",
 }
+# Of them, those that a fitted model may teach.
+TAUGHT: tuple[str, ...] = ("student",)
 # Models with a closed form: functions (source, *, settings, progress) -> Material.
 CLOSED_FORM: dict[str, str] = {
     "lambert": "btfkit.fitting.lambert:lambert",
@@ -43,6 +46,7 @@ SETTINGS: dict[str, str] = {
     "sbtf-paper": "btfkit.fitting.sbtf.settings:PaperSettings",
     "neubtf": "btfkit.fitting.neubtf.settings:Settings",
     "neubtf-paper": "btfkit.fitting.neubtf.settings:PaperSettings",
+    "student": "btfkit.fitting.student.settings:Settings",
 }
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from btfkit.btf import BTF
 from btfkit.errors import FitError, unknown
 from btfkit.files import refuse_existing
-from btfkit.fitting import CLOSED_FORM, MODELS, TRACED, loaded
+from btfkit.fitting import CLOSED_FORM, MODELS, TAUGHT, TRACED, loaded
 from btfkit.fitting.phases import Phases, Told
 from btfkit.fitting.reading import masked, read_once
 from btfkit.fitting.report import FitReport
@@ -33,9 +33,10 @@ _DEVICES = ("auto", "cpu", "cuda")
 
 
 def fit(
-    source: BTF | QuerySet | Relief,
+    source: BTF | QuerySet | Relief | None,
     *,
     model: str = "auto",
+    teacher: Material | None = None,
     budget_s: float = 300.0,
     steps: int | None = None,
     holdout: float = 0.05,
@@ -58,6 +59,8 @@ def fit(
         source: a BTF, queries with answers, or a relief (traced on a Bonn-81 grid first, or as
             the model asks for).
         model: a name of `MODELS`, or "auto".
+        teacher: a fitted model whose answers a `student` learns; then `source` may be None: what
+            the errors tell is how far the student is from its teacher.
         budget_s: wall time from the end of reading to the end, seconds, evaluation included: that
             takes at most a tenth, at least 2 s. `steps` takes its place where given.
         holdout: share of direction pairs (of rows, for queries) kept for the test, 0 to 1.
@@ -79,12 +82,13 @@ def fit(
         OSError: nothing can be written where `out` shall lie.
     """
     _check(model, budget_s, steps, device)
+    _check_taught(model, source, teacher)
     split(1, holdout, seed)  # refuses what is no share
     final = _out(out, resume=resume, force=force)
     plan = Plan(steps, final, resume, force or resume, seed, holdout, device)
     phases = Phases(budget_s if steps is None else None, phase)
     phases.begin("reading")
-    data = read_once(_traced(source, model, seed))
+    data = read_once(_traced(_asked(source, teacher, seed), model, seed))
     chosen, choice, parts = _chosen(data, model)
     relief = source if isinstance(source, Relief) else None
     if relief is not None and chosen in TRACED:
@@ -94,13 +98,16 @@ def fit(
         train = split(len(data), holdout, seed)[0]
         material, run = solved(data.subset(train), chosen, given, plan, progress)
     else:
-        material, run = trained(data, chosen, given, plan, phases, progress, relief)
+        material, run = trained(data, chosen, given, plan, phases, progress, relief, teacher)
     if phases.late():
         said = f"starting took {phases.seconds['starting']:.0f} s of a budget of {budget_s:g} s"
         choice = (*choice, f"{said}: training had its least share, and ended late")
     if _cpu_alone(chosen, run.device, device):
         choice = (*choice, f"trained on the CPU: {chosen} cannot use a GPU")
     provenance = _provenance(data, plan, given, run)
+    if teacher is not None:
+        of = {"model": teacher.model, "provenance": dict(teacher.header.provenance)}
+        provenance["teacher"] = of
     header = replace(material.header, provenance=provenance, steps=run.steps)
     material = type(material)(material.spec, material.weights, header)
     if final is not None:
@@ -135,6 +142,28 @@ def _check(model: str, budget_s: float, steps: int | None, device: str) -> None:
         raise ValueError(f"steps = {steps}; expected 0 or more")
     if device not in _DEVICES:
         raise ValueError(unknown("device", device, _DEVICES))
+
+
+def _check_taught(
+    model: str, source: BTF | QuerySet | Relief | None, teacher: Material | None
+) -> None:
+    """ValueError for a teacher nobody listens to, or neither data nor teacher."""
+    if teacher is not None and model not in TAUGHT:
+        raise ValueError(f"{model} learns from data alone; from a model does: {', '.join(TAUGHT)}")
+    if source is None and teacher is None:
+        raise ValueError("nothing to fit to: neither data nor a teacher is named")
+
+
+def _asked(
+    source: BTF | QuerySet | Relief | None, teacher: Material | None, seed: int
+) -> BTF | QuerySet | Relief:
+    """The data, or queries that the teacher answers."""
+    if source is not None:
+        return source
+    from btfkit.fitting.student.lessons import queries_of
+
+    assert teacher is not None
+    return queries_of(teacher, seed=seed)
 
 
 def _out(out: str | os.PathLike[str] | None, *, resume: bool, force: bool) -> Path | None:

@@ -83,11 +83,13 @@ def trained(
     phases: Phases,
     progress: Progress | None,
     relief: Relief | None = None,
+    teacher: Material | None = None,
 ) -> tuple[Material, Ran]:
     """A model trained by steps, until they or the budget are spent, or Ctrl-C ends it.
 
     Args:
         relief: what the source was traced from, if it was.
+        teacher: whose answers the model learns, if it does.
     """
     import torch
 
@@ -103,7 +105,7 @@ def trained(
     train, test = split(len(source), plan.holdout, plan.seed)
     trainable: loop.Trainable = loaded(TRAINED[model])(
         source, train, test, settings=settings, generators=generators,
-        progress=phases.reading(progress),
+        progress=phases.reading(progress), **({} if teacher is None else {"teacher": teacher}),
     )  # fmt: skip
     if relief is not None:
         trainable.know(relief)

@@ -16,6 +16,7 @@ MODELS: dict[str, str] = {
     "neubtf-paper": "btfkit.materials.neubtf.paper:NeuBTFPaper",
     "neumip": "btfkit.materials.neumip.material:NeuMIP",
     "neumip-paper": "btfkit.materials.neumip.material:NeuMIPPaper",
+    "student": "btfkit.materials.neumip.material:Student",
     "sbtf": "btfkit.materials.sbtf.material:SBTF",
     "sbtf-paper": "btfkit.materials.sbtf.paper:SBTFPaper",
 }
@@ -28,6 +29,7 @@ PROGRAMS: tuple[str, ...] = (
     "neubtf-paper",
     "neumip",
     "neumip-paper",
+    "student",
     "sbtf",
     "sbtf-paper",
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from btfkit.materials.base import Header, Material
@@ -28,6 +30,7 @@ SPECS = {
 }
 
 
+@cache
 def made(name: str, *, seed: int = 0) -> Material:
     """The material of a case, its numbers random and such that answers are between 0 and 10."""
     kind, spec, wrap = SPECS[name]

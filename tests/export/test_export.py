@@ -8,17 +8,18 @@ import subprocess
 import sys
 import warnings
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import needs
 import numpy as np
 import pytest
-from cases import SPECS, directions, made
+from cases import GRID, SPECS, directions, made
 
 from btfkit.cli import btfkit
 from btfkit.cli.outcome import run
-from btfkit.export import TARGETS
+from btfkit.export import TARGETS, exr, npz
 from btfkit.export.arrays import named, narrowed
 from btfkit.export.glsl.atlas import atlas, quantised
 from btfkit.export.package import export
@@ -30,6 +31,7 @@ from btfkit.materials.lambert import Lambert, LambertSpec
 from btfkit.materials.measured.interpolation import Interpolation
 from btfkit.program import Dense, Head, Heights, Program, Texture
 from btfkit.relief.synth import synth_btf
+from btfkit.view.model import page
 
 every_case = pytest.mark.parametrize("name", list(SPECS))
 # float32 through the layers in another order; of large values the same share.
@@ -96,7 +98,8 @@ def test_arrays_and_their_reader_in_numpy_answer_as_the_material(
     target: str, name: str, tmp_path: Path
 ) -> None:
     material, queries = made(name), asked()
-    export(material, target, tmp_path / "out")
+    (tmp_path / "out").mkdir()
+    {"npz": npz, "exr": exr}[target].write(material, material.program(), tmp_path / "out")
     np.savez(tmp_path / "q.npz", **queries._asdict())
     command = [sys.executable, tmp_path / "out" / "evaluate.py", tmp_path / "q.npz"]
     subprocess.run([*command, tmp_path / "a.npz"], check=True)
@@ -156,8 +159,6 @@ def test_bright_answers_keep_their_share(value: float, tmp_path: Path) -> None:
         ("R", "G", "B"), (4, 4), 1.0, True, (texture,), texture.features, (layer,),
         (Head("log", 3),), "log",
     )  # fmt: skip
-    from btfkit.export import npz
-
     folder = tmp_path / "out"
     folder.mkdir()
     npz.write(made("lambert"), program, folder)
@@ -195,6 +196,12 @@ def test_papers_and_a_picture_travel_along(target: str, tmp_path: Path) -> None:
     assert about["tile_mm"] == [9.0, 6.0]
     assert about["colour"] == "linear BT.709, D65"
     assert (tmp_path / "out" / "preview.png").read_bytes().startswith(b"\x89PNG")
+    if target != "mitsuba":
+        finest = made("lambert").lobes.levels[0]
+        w, h = about["lobes"]["size"]
+        stored = np.fromfile(tmp_path / "out" / about["lobes"]["file"], "<f2").reshape(h, w, -1)
+        np.testing.assert_array_equal(stored, finest.astype(np.float16))
+        assert len(about["lobes"]["columns"]) == finest.shape[2]
     files = {path.name: path.stat().st_size for path in (tmp_path / "out").iterdir()}
     assert result["files"] == dict(sorted(files.items()))
     assert result["bytes"] == sum(files.values())
@@ -237,9 +244,7 @@ def test_a_quantised_program_is_off_by_half_a_step(texels: Any, step: float) -> 
 
 def test_what_no_export_knows_is_refused_by_name(tmp_path: Path) -> None:
     material = made("lambert")
-    with pytest.raises(
-        ValueError, match="no target 'pdf'; there are npz, cpp, glsl, exr, three, onnx, wgsl, slang"
-    ):
+    with pytest.raises(ValueError, match=f"no target 'pdf'; there are {', '.join(TARGETS)}"):
         export(material, "pdf", tmp_path / "out")
     btf = synth_btf("knit", size=8, lights="3", views="3", samples=1)
     with pytest.raises(TypeError, match="interpolation blends measured pairs"):
@@ -264,6 +269,77 @@ def test_what_no_export_knows_is_refused_by_name(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
     with pytest.raises(ValueError, match="no value for @there@"):
         filled("@there@")
+
+
+HOSTILE = (
+    "</script><script>alert(1)</script>", "*/ discard; /*", '"); __import__("os").abort() #',
+    "`${location}`\n#include </etc/passwd>", "../../../outside", "@title@", "<img src=x onerror=a>",
+)  # fmt: skip
+
+
+def hostile(names: tuple[str, ...] = HOSTILE) -> Material:
+    """A material with these channels, and a licence and a provenance that hold them all."""
+    c = len(names)
+    header = Header(
+        GRID, names, licence=" ".join(names), texel_mm=0.1, provenance={n: [n] for n in names}
+    )
+    texture = np.random.default_rng(0).random((4, 6, c), dtype=np.float32)
+    return Lambert(LambertSpec((4, 6), channels=c), {"texture": texture}, header)
+
+
+def test_names_of_a_file_never_become_part_of_a_program(tmp_path: Path) -> None:
+    """Only JSON, where they are escaped, holds what a file calls its channels or its licence."""
+    material = hostile()
+    result = export(material, "glsl", tmp_path / "whole")
+    assert result["licence"] == " ".join(HOSTILE)
+    assert json.loads((tmp_path / "whole" / "about.json").read_text())["channels"] == list(HOSTILE)
+    for target, home in TARGETS.items():
+        if target in ("onnx", "mitsuba"):
+            # Metadata of a graph and of a model file; no text of theirs is a program's.
+            continue
+        module, function = home.split(":")
+        (tmp_path / target).mkdir()
+        getattr(import_module(module), function)(material, material.program(), tmp_path / target)
+    for path in tmp_path.rglob("*"):
+        if path.is_dir() or path.suffix in (".json", ".png", ".bin", ".npz", ".exr"):
+            continue
+        text = path.read_text()
+        assert not [name for name in HOSTILE if name in text], path
+    assert {path.name for path in tmp_path.iterdir()} <= {*TARGETS, "whole"}
+
+
+def test_a_page_shows_names_of_a_file_as_text() -> None:
+    plain = tuple("abcdefg")
+    shown = page(hostile(), title=" ".join(HOSTILE))
+    assert "<img" not in shown
+    assert shown.count("</script>") == page(hostile(plain), title="plain").count("</script>")
+
+
+@pytest.mark.parametrize("spoil", ["newer", "truncated", "foreign"])
+def test_a_damaged_model_is_refused_before_anything_is_written(
+    spoil: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, out = tmp_path / "flat.lambert.safetensors", tmp_path / "flat"
+    save(made("lambert"), model)
+    data = model.read_bytes()
+    if spoil == "newer":
+        data = data.replace(b'"btfkit":"1"', b'"btfkit":"9"')
+    elif spoil == "truncated":
+        data = data[:-40]
+    else:
+        data = data.replace(b'"texture"', b'"texturd"')
+    model.write_bytes(data)
+    said = {
+        "newer": "file version 9; this version reads up to 1",
+        "truncated": "not a readable safetensors file",
+        "foreign": "texturd",
+    }
+    assert run(btfkit, ["export", str(model), "--to", "wgsl", "-o", str(out)]) == 1
+    message = capsys.readouterr().err
+    assert said[spoil] in message
+    assert len(message.strip().splitlines()) == 1
+    assert not out.exists()
+    assert {path.name for path in tmp_path.iterdir()} == {model.name}
 
 
 def test_the_verb_writes_a_folder_and_replaces_none_unasked(

@@ -37,6 +37,7 @@ TINY: dict[str, tuple[int, dict[str, str]]] = {
     "rainer20": (200, {"pairs": "16", "texels": "32", "subset": "16", "rate": "5e-3"}),
     "neumip": (150, {"batch": "1024", "levels": "1"}),
     "neumip-paper": (150, {"batch": "1024", "levels": "1"}),
+    "student": (150, {"batch": "1024", "levels": "1"}),
     "sbtf": (150, {"batch": "1024", "levels": "1"}),
     "sbtf-paper": (60, {"batch": "1024", "rate": "2e-2"}),
     "neubtf": (150, {"batch": "1024", "free": "0.9", "kept": "false"}),

@@ -47,25 +47,40 @@ class Recipe(Trainable, ABC, Generic[S]):
         self.settings = s = parsed(self.settings_type, self.model, settings)
         refuse_unused(s, self.model, settings, pictures=isinstance(source, BTF))
         self._generators, self._data = generators, source
-        self._header = header_of(source, s)
+        self._header = self._headed(source)
         size = texture_size(self._header.grid, s.size)
-        levels = s.levels or _levels_for(source, size)
+        levels = s.levels or self._levels(source, size)
         self.spec = self._spec(size, min(levels, most_levels(size)))
         self.layout = self.spec.layout(self._header)
-        self._source: Source
-        if isinstance(source, BTF):
-            self._source = TexelSource(
-                source, train, test, levels=self._data_levels(), seed=generators.seed,
-                pool_bytes=s.pool_mb << 20, progress=progress,
-            )  # fmt: skip
-        else:
-            self._source = RowSource(
-                source, train, test, seed=generators.seed, curved=self.spec.curved
-            )
+        self._source = self._batches(source, train, test, progress)
         self.masked = self._source.masked
         self._held = self._source.held_out()
         self._pairs = len(train)
         self._begin(generators.numpy)
+
+    def _headed(self, source: BTF | QuerySet) -> Header:
+        """What the model will say of itself."""
+        return header_of(source, self.settings)
+
+    def _levels(self, source: BTF | QuerySet, size: tuple[int, int]) -> int:
+        """Levels of detail where no setting names them."""
+        return _levels_for(source, size)
+
+    def _batches(
+        self,
+        source: BTF | QuerySet,
+        train: NDArray[np.intp],
+        test: NDArray[np.intp],
+        progress: Any,
+    ) -> Source:
+        """What is drawn from, once the model's shapes are known."""
+        seed = self._generators.seed
+        if isinstance(source, BTF):
+            return TexelSource(
+                source, train, test, levels=self._data_levels(), seed=seed,
+                pool_bytes=self.settings.pool_mb << 20, progress=progress,
+            )  # fmt: skip
+        return RowSource(source, train, test, seed=seed, curved=self.spec.curved)
 
     @property
     def source(self) -> Source:

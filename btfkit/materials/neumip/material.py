@@ -109,6 +109,13 @@ class NeuMIPPaper(NeuMIPMaterial):
     model: ClassVar[str] = "neumip-paper"
 
 
+@final
+class Student(NeuMIPMaterial):
+    """A NeuMIP with two small layers, for phones and games."""
+
+    model: ClassVar[str] = "student"
+
+
 def in_precision(
     material: NeuMIPMaterial, precision: Precision, networks: Networks | None = None
 ) -> NeuMIPMaterial:

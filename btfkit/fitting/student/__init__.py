@@ -1,0 +1,1 @@
+"""A small NeuMIP while it is fitted: to data, or to the answers of a larger model."""
