@@ -1,9 +1,10 @@
-"""`btfkit render`: a material on a shape -> a picture."""
+"""`btfkit render`: a material on a shape -> a picture, a comparison, a sweep, a table of pairs."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import click
 
 from btfkit.cli.bar import Bar
 from btfkit.cli.options import (
+    DurationType,
     LocationType,
     NumbersType,
     force_option,
@@ -24,11 +26,12 @@ from btfkit.remote import Location
 
 if TYPE_CHECKING:
     from btfkit.materials.base import Material
-    from btfkit.shapes.closed import Floats
+    from btfkit.render.preview import Rendering
+    from btfkit.render.shot import Shot
 
 _ANGLES = NumbersType("THETA,PHI", float)
+_PANEL = NumbersType("THETA,PHI,W,H,DISTANCE", float)
 _MOST_SIDE = 16384
-_SIDE = 512
 # Bytes of a BTF that is read as a whole.
 _IN_MEMORY = 1 << 30
 
@@ -36,14 +39,18 @@ _IN_MEMORY = 1 << 30
 @verb(
     "render",
     example="""btfkit render wool.neumip.safetensors -o wool.png --shape sphere --light 40,45
-btfkit render wool.btf.zarr -o wool.exr --shape torus --env hall.hdr --repeat 3""",
+btfkit render wool.btf.zarr -o wool.exr --shape torus --env hall.hdr --repeat 3
+btfkit render wool.neumip.safetensors --compare wool.btf.zarr --shape cylinder
+btfkit render wool.neumip.safetensors --sweep view -o wool.webp --shape torus""",
 )
 @click.argument("source", metavar="MODEL_OR_BTF", type=LocationType())
-@out_option("*.png or *.jpg (sRGB), *.exr (linear); by default the source's name with .png, here")
+@out_option("*.png or *.jpg (sRGB), *.exr (linear), of a sweep *.webp or *.mp4; by default here")
 @click.option("--shape", default="plane", show_default=True,
-              help="plane, sphere, cylinder, torus or FILE.obj.")  # fmt: skip
+              help="plane, sphere, cylinder, torus, FILE.obj or FILE.ply.")  # fmt: skip
 @click.option("--light", "lights", type=_ANGLES, multiple=True,
               help="Far away, degrees; repeatable. Key, fill and rim where none is.")  # fmt: skip
+@click.option("--panel", "panels", type=_PANEL, multiple=True,
+              help="An area light that faces the object, of radius 1; repeatable.")  # fmt: skip
 @click.option("--env", type=click.Path(path_type=Path), help="Surroundings, *.hdr or *.exr.")
 @click.option("--env-turn", type=float, default=0.0, help="Turn them about y, degrees.")
 @click.option("--view", type=_ANGLES, default="0,0", show_default=True, help="To the eye, degrees.")
@@ -53,9 +60,21 @@ btfkit render wool.btf.zarr -o wool.exr --shape torus --env hall.hdr --repeat 3"
     "--size", type=NumbersType("WxH", int, "x"), help="Pixels; by default 512 on the longer side."
 )
 @click.option("--spp", type=click.IntRange(1, 65536), help="Rays a pixel; as needed by default.")
+@click.option("--within", "within_s", type=DurationType(),
+              help="Ends with the passes finished by then; the first always is.")  # fmt: skip
 @click.option("--exposure", type=float, default=0.0, show_default=True, help="Stops, PNG only.")
 @click.option("--background", type=NumbersType("R,G,B", float),
               help="Linear, PNG only; black, or grey without --light and --env.")  # fmt: skip
+@click.option("--compare", metavar="OTHER", type=LocationType(),
+              help="Side by side with another model or BTF, and the difference.")  # fmt: skip
+@click.option("--sweep", type=click.Choice(["light", "view", "footprint"]),
+              help="An animation: the light or the eye goes round, or detail is lost.")  # fmt: skip
+@click.option("--frames", type=click.IntRange(2, 10000), default=36, show_default=True,
+              help="Pictures of a sweep.")  # fmt: skip
+@click.option("--fps", type=click.FloatRange(1, 120), default=12, show_default=True,
+              help="Of a sweep.")  # fmt: skip
+@click.option("--pairs", type=click.IntRange(2, 16),
+              help="A table of so many views by so many lights, texel by texel.")  # fmt: skip
 @seed_option
 @force_option
 def render_verb(
@@ -63,90 +82,198 @@ def render_verb(
     *,
     source: Location,
     out: Path | None,
-    shape: str,
-    lights: tuple[tuple[float, float], ...],
-    env: Path | None,
-    env_turn: float,
-    view: tuple[float, float],
-    repeat: int,
     size: tuple[int, int] | None,
-    spp: int | None,
     exposure: float,
     background: tuple[float, float, float] | None,
-    seed: int,
+    compare: Location | None,
+    sweep: Any,
+    frames: int,
+    fps: float,
+    pairs: int | None,
     force: bool,
+    **chosen: Any,
 ) -> Outcome:
     """Draw a model, a BTF or a relief on a shape, seen from far away.
 
     Angles are in the object's frame: x right, y up, z towards the viewer of --view 0,0; THETA from
     z, PHI from x towards y. A white surface that faces one --light is 1. A plane fills the picture.
-    Without --light and --env a studio lights it: key, fill and rim light before grey.
+    Without --light, --panel and --env a studio lights it: key, fill and rim light before grey.
+    An interruption keeps the rays that were finished.
     """
-    from btfkit import sources
     from btfkit.files import refuse_existing
-    from btfkit.render import picture, studio
-    from btfkit.render.environment import Environment
-    from btfkit.render.preview import Scene, enough_samples, render
-    from btfkit.shapes.catalogue import shape_of
+    from btfkit.render import animation, picture
 
     start = time.perf_counter()
+    if sum(each is not None for each in (compare, sweep, pairs)) > 1:
+        raise click.UsageError("--compare, --sweep and --pairs exclude each other")
     if size is not None:
         _check_size(size)
-    if not all(math.isfinite(number) for number in (env_turn, exposure, *(background or ()))):
+    if not all(
+        math.isfinite(number) for number in (chosen["env_turn"], exposure, *(background or ()))
+    ):
         raise click.UsageError("--env-turn, --exposure and --background take finite numbers")
-    final = out or Path(stem(source) + ".png")
-    picture.check_name(final)
+    shot = _shot(size, **chosen)
+    kind = "compare" if compare else "pairs" if pairs else None
+    suffix = ".webp" if sweep else f".{kind}.png" if kind else ".png"
+    final = out or Path(stem(source) + suffix)
+    if sweep:
+        animation.check_name(final)
+    else:
+        picture.check_name(final)
+    if kind and final.suffix.lower() == ".exr":
+        raise ValueError(f"{final}: a sheet of --{kind} is *.png or *.jpg")
     refuse_existing(final, force=force)
-    material = sources.material(source, curved=shape != "plane")
-    if env is not None or shape != "plane":
-        # Such a picture needs most of the textures anyway.
-        material = _at_hand(material)
-    # A plane fills the picture, which by default has the shape of the material.
-    w, h = size or _shaped(material.header.aspect if shape == "plane" else 1.0)
-    channels = material.header.channels
-    in_studio = not lights and env is None
-    if in_studio:
-        lights = studio.ANGLES
-    irradiance = studio.IRRADIANCE if in_studio else (1.0,) * len(lights)
-    surroundings = None
-    if env is not None:
-        radiance = picture.read_surroundings(env, channels=channels)
-        surroundings = Environment(radiance, turn=math.radians(env_turn))
-    scene = Scene(
-        material,
-        shape_of(shape, repeat=repeat, aspect=material.header.aspect, picture=w / h),
-        _directions("--light", lights),
-        surroundings,
-        irradiance,
+    material = _material(source, shot)
+    look = _Look(material.header.channels, exposure, background or shot.background)
+    if sweep:
+        shots = animation.shots(shot, sweep, frames, material)
+        seen = [look.codes(each) for each in animation.frames(shots, material, bar)]
+        made: dict[str, Any] = {"sweep": sweep, "frames": frames, "fps": fps}
+        _write(final, lambda path: animation.write(path, seen, fps=fps), force)
+    elif pairs:
+        made = _pairs_sheet(material, look, pairs, final, bar, force)
+    elif compare:
+        made = _comparison(source, material, compare, shot, look, final, bar, force)
+    else:
+        return _still(source, material, shot, look, final, bar, force, start)
+    seconds = time.perf_counter() - start
+    said = "".join(f", {key} {made[key]:.4g}" for key in ("psnr", "mae") if key in made)
+    return Outcome(
+        f"{final}: {seconds:.1f} s{said}",
+        {"out": final, "source": source, "model": material.model, **made, "seconds": seconds},
+        then="open it",
     )
-    eye = _directions("--view", (view,))[0]
-    samples = spp or enough_samples(scene, eye, (h, w))
-    seen = render(scene, view=eye, size=(h, w), samples=samples, seed=seed, progress=bar)
+
+
+def _still(
+    source: Location, material: Material, shot: Shot, look: _Look, final: Path, bar: Bar, force: bool,
+    start: float,
+) -> Outcome:  # fmt: skip
+    from btfkit.render import picture, studio
+
+    seen = shot.taken(shot.scene(material), bar)
+    w, h = shot.size_of(material)
+    lights = studio.ANGLES if shot.in_studio else shot.lights
+    irradiance = studio.IRRADIANCE if shot.in_studio else (1.0,) * len(lights)
     about = {
         "source": source, "model": material.model, "licence": material.header.licence,
         "quantity": "radiance; 1 is a white diffuser that faces one light",
-        "shape": shape, "lights_deg": lights, "irradiance": irradiance,
-        "env": env, "env_turn_deg": env_turn,
-        "view_deg": view, "repeat": repeat, "spp": samples, "seed": seed,
+        "shape": shot.shape, "lights_deg": lights, "irradiance": irradiance,
+        "panels": shot.panels, "env": shot.env, "env_turn_deg": shot.env_turn,
+        "view_deg": shot.view, "repeat": shot.repeat, "spp": seen.samples, "seed": shot.seed,
     }  # fmt: skip
     picture.write(
-        seen, final, channels=channels, exposure=exposure,
-        background=background or (studio.GREY if in_studio else (0, 0, 0)),
-        about=plain(about), force=force,
+        seen, final, channels=look.channels, exposure=look.exposure,
+        background=look.background, about=plain(about), force=force,
     )  # fmt: skip
+    if seen.interrupted:
+        raise KeyboardInterrupt
     seconds = time.perf_counter() - start
     return Outcome(
-        f"{final}: {w} x {h}, {samples} rays a pixel, {seen.asked} queries, {seconds:.1f} s",
+        f"{final}: {w} x {h}, {seen.samples} rays a pixel, {seen.asked} queries, {seconds:.1f} s",
         {"out": final, "size": (w, h), "queries": seen.asked, "seconds": seconds,
          "cover": float(seen.cover.mean()), **about},
         then="open it; --env FILE.hdr lights it by surroundings, --repeat tiles it",
     )  # fmt: skip
 
 
-def _shaped(aspect: float) -> tuple[int, int]:
-    """Width and height of a picture of that shape, at most `_SIDE` pixels a side."""
-    short = max(1, round(_SIDE * min(aspect, 1 / aspect)))
-    return (_SIDE, short) if aspect >= 1 else (short, _SIDE)
+def _comparison(
+    source: Location, material: Material, compare: Location, shot: Shot, look: _Look, final: Path, bar: Bar,
+    force: bool,
+) -> dict[str, Any]:  # fmt: skip
+    """Writes two materials side by side and their difference; the figures."""
+    from dataclasses import replace
+
+    from btfkit.render import sheets
+
+    other = _material(compare, shot)
+    if other.header.channels != material.header.channels:
+        raise ValueError(
+            f"{source} has channels {', '.join(material.header.channels)}, {compare} "
+            f"{', '.join(other.header.channels)}: they cannot be compared"
+        )
+    # One size and one number of rays for both, so that pixels answer pixels.
+    same = replace(shot, size=shot.size_of(material))
+    first = same.taken(same.scene(material), bar)
+    same = replace(same, samples=first.samples)
+    second = same.taken(same.scene(other), bar)
+    figures = sheets.compared(first, second)
+    sheet = sheets.side_by_side(
+        (look.linear(first), look.linear(second)), (stem(source), stem(compare)), figures
+    )
+    look.write(sheet, final, force)
+    return {"compare": compare, "spp": first.samples, **figures}
+
+
+def _pairs_sheet(
+    material: Material, look: _Look, count: int, final: Path, bar: Bar, force: bool
+) -> dict[str, Any]:
+    from btfkit.render import sheets
+
+    sheet, angles = sheets.direction_pairs(
+        material, look.to_rgb, count=count, exposure=look.exposure, progress=bar
+    )
+    look.write(sheet, final, force)
+    return {"pairs": count, "directions_deg": angles}
+
+
+class _Look:
+    """How radiance is shown: its colours, exposed, over a background."""
+
+    def __init__(self, channels: tuple[str, ...], exposure: float, background: Any) -> None:
+        self.channels, self.exposure, self.background = channels, exposure, background
+
+    @property
+    def to_rgb(self) -> Any:
+        """(c, 3) from channels to linear RGB."""
+        from btfkit.render import picture
+
+        return picture.to_rgb(self.channels)
+
+    def linear(self, seen: Rendering) -> Any:
+        """(h, w, 3) linear RGB as shown."""
+        import numpy as np
+
+        shown = seen.radiance @ self.to_rgb * np.float32(2.0**self.exposure)
+        return shown + (1 - seen.cover[..., None]) * np.asarray(self.background, np.float32)
+
+    def codes(self, seen: Rendering) -> Any:
+        """(h, w, 3) 8-bit sRGB."""
+        from btfkit.render import sheets
+
+        return sheets.codes_of(self.linear(seen))
+
+    def write(self, codes: Any, final: Path, force: bool) -> None:
+        """Write 8-bit sRGB as PNG or JPEG."""
+        from PIL import Image
+
+        _write(final, lambda path: Image.fromarray(codes).save(path, quality=95), force)
+
+
+def _write(final: Path, write: Callable[[Path], None], force: bool) -> None:
+    from btfkit.files import whole
+
+    with whole(final, force=force) as partial:
+        write(partial)
+
+
+def _shot(size: tuple[int, int] | None, *, spp: int | None, **chosen: Any) -> Shot:
+    from btfkit.render.shot import Shot
+
+    for name in ("lights", "panels"):
+        _check_finite("--" + name.rstrip("s"), chosen[name])
+    _check_finite("--view", (chosen["view"],))
+    return Shot(size=size, samples=spp, **chosen)
+
+
+def _material(source: Location, shot: Shot) -> Material:
+    """What is drawn; in memory where a picture needs most of it anyway."""
+    from btfkit import sources
+
+    material = sources.material(source, curved=shot.shape != "plane")
+    if shot.env is not None or shot.panels or shot.shape != "plane":
+        return _at_hand(material)
+    return material
 
 
 def _check_size(size: tuple[int, int]) -> None:
@@ -156,16 +283,9 @@ def _check_size(size: tuple[int, int]) -> None:
         )
 
 
-def _directions(option: str, angles: tuple[tuple[float, float], ...]) -> Floats:
-    """(n, 3) unit vectors of angles in degrees."""
-    import numpy as np
-
-    from btfkit.directions import from_angles
-
-    degrees = np.reshape(np.array(angles, float), (-1, 2))
-    if not np.isfinite(degrees).all():
+def _check_finite(option: str, numbers: Any) -> None:
+    if not all(math.isfinite(number) for each in numbers for number in each):
         raise click.BadParameter("expected finite angles in degrees", param_hint=option)
-    return from_angles(*np.radians(degrees).T)
 
 
 def _at_hand(material: Material) -> Material:

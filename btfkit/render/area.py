@@ -31,9 +31,7 @@ class AreaLight:
 
     def __init__(self, way: Floats, size: tuple[float, float], distance: float) -> None:
         if not (np.isfinite([*size, distance]).all() and min(*size, distance) > 0):
-            raise ValueError(
-                f"a panel of {size[0]:g} x {size[1]:g} at {distance:g}; all are positive"
-            )
+            raise ValueError(f"a panel of {size[0]:g} x {size[1]:g} at {distance:g}; all above 0")
         if distance <= _OBJECT:
             raise ValueError(
                 f"a panel at {distance:g} reaches into the object, of radius 1; put it farther"

@@ -48,6 +48,7 @@ class Scene:
         environment: light from everywhere, or None.
         irradiance: (n,) of each light on a surface that faces it; None is 1 of each.
         panels: area lights near the object.
+        blur: factor on footprints: 1 is a pixel's own.
     """
 
     material: Material
@@ -56,6 +57,7 @@ class Scene:
     environment: Environment | None = None
     irradiance: Sequence[float] | None = None
     panels: Sequence[AreaLight] = ()
+    blur: float = 1.0
 
 
 class Rendering(NamedTuple):
@@ -175,7 +177,8 @@ class _Painter:
     def __init__(self, scene: Scene, camera: Camera, drawn: PixelSamples) -> None:
         self._scene, self._camera, self._drawn = scene, camera, drawn
         # Samples share the pixel: each answers for its part.
-        self._pixel = np.stack([camera.right, camera.down]) / np.sqrt(drawn.samples)
+        steps = np.stack([camera.right, camera.down]) / np.sqrt(drawn.samples)
+        self._pixel = steps * scene.blur
         self._shadows = Shadows(scene.material, scene.shape, self._pixel)
         self._own = self.not_finite = 0
 

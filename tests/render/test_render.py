@@ -74,6 +74,10 @@ class Painted(Material):
         return np.concatenate([getattr(query, part) for query in self.asked])
 
 
+class Fine(Painted):
+    has_levels: ClassVar[bool] = False
+
+
 class Bent(Painted):
     has_curvature: ClassVar[bool] = True
 
@@ -286,9 +290,6 @@ def test_footprint_grows_where_a_plane_turns_away() -> None:
 
 
 def test_a_material_without_levels_is_asked_at_its_finest_and_sampled_more() -> None:
-    class Fine(Painted):
-        has_levels: ClassVar[bool] = False
-
     fine = Fine(white(64))
     pictured(fine, "plane", size=(16, 16))
     assert fine.all_asked("footprint").max() == 0.5
@@ -1004,3 +1005,121 @@ def test_progress_reaches_the_whole_picture() -> None:
     # Rays: 64 for each of 8192 pixels.
     assert told[-1] == (64 * 8192, 64 * 8192)
     assert len(told) > 1
+
+
+# --- comparisons, sweeps, tables
+
+
+def test_a_comparison_states_the_difference_that_pictures_have(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from PIL import Image
+
+    other = writer.write(
+        BTF(
+            np.full((4, 12, 20, 3), 0.25, np.float16),
+            np.stack([towards(*a) for a in [(40, 45), (15, 200), (0, 0), (60, 300)]]),
+            np.tile(ABOVE, (4, 1)),
+        ),
+        tmp_path / "grey.btf.zarr",
+    )
+    sheet, options = tmp_path / "c.png", ("--light", "40,45", "--size", "20x12", "--spp", "1")
+    assert call("render", store, "--compare", other, "-o", sheet, "--json", *options) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    for name in (store, other):
+        assert call("render", name, "-o", tmp_path / (name.name + ".exr"), *options) == 0
+    values = [read_exr(tmp_path / (n.name + ".exr"))[0][..., :3] for n in (store, other)]
+    gap = values[1] - values[0]
+    assert told["mae"] == pytest.approx(float(np.abs(gap).mean()), rel=1e-5)
+    assert told["psnr"] == pytest.approx(-10 * np.log10(np.square(gap).mean()), rel=1e-5)
+    with Image.open(sheet) as shown:
+        assert shown.width >= 3 * 20
+    # The same twice: no difference at all.
+    assert (
+        call("render", store, "--compare", store, "-o", sheet, "--json", "--force", *options) == 0
+    )
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["largest"] == 0
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".mp4"])
+@pytest.mark.parametrize("sweep", ["light", "view"])
+def test_a_sweep_goes_round_once(
+    sweep: str, suffix: str, store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from PIL import Image
+
+    out = tmp_path / f"s{suffix}"
+    if suffix == ".mp4":
+        pytest.importorskip("av", reason="MP4 needs the extra video")
+    options = ("--shape", "sphere", "--light", "60,0", "--size", "33x32", "--spp", "1")
+    assert call("render", store, "-o", out, "--sweep", sweep, "--frames", "4", *options) == 0
+    if suffix == ".webp":
+        film = Image.open(out)
+        assert film.n_frames == 4
+        shown = []
+        for k in range(4):
+            film.seek(k)
+            shown.append(np.asarray(film.convert("RGB"), float))
+        film.close()
+    else:
+        import av
+
+        with av.open(str(out)) as film:
+            shown = [f.to_ndarray(format="rgb24").astype(float) for f in film.decode(video=0)]
+    assert len(shown) == 4
+    middle = [np.argmax(frame.sum(axis=(0, 2))[:33]) for frame in shown]
+    if sweep == "light":
+        # From the right, from above, from the left, from below.
+        assert middle[0] > 20
+        assert middle[2] < 12
+    else:
+        # Lights stay with the eye: always from the right.
+        assert min(middle) > 16
+
+
+def test_a_sweep_of_the_footprint_ends_in_the_mean() -> None:
+    from btfkit.render import animation
+    from btfkit.render.shot import Shot
+
+    painted = Painted(corners())
+    shots = animation.shots(Shot(size=(8, 8), lights=[(0, 0)]), "footprint", 3, painted)
+    list(animation.frames(shots, painted))
+    told = [float(query.footprint.mean()) for query in painted.asked if len(query.uv) == 64]
+    # A tile of 16 texels on 8 pixels: 1 texel at first, 16 times that at level 4.
+    np.testing.assert_allclose(told, [1, 4, 16], rtol=1e-5)
+    with pytest.raises(ValueError, match="no levels of detail"):
+        animation.shots(Shot(), "footprint", 3, Fine(white()))
+
+
+def test_a_table_of_pairs_shows_each_view_under_each_light(store: Path, tmp_path: Path) -> None:
+    from PIL import Image
+
+    out = tmp_path / "t.png"
+    assert call("render", store, "--pairs", "3", "-o", out) == 0
+    with Image.open(out) as sheet:
+        # Three cells of 20 x 12 texels, margins of 6, a line of text above and one a row.
+        assert sheet.size == (6 + 3 * 26, 20 + 3 * (12 + 20))
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    (("--sweep", "view", "-o", "a.png"), "sweeps are *.webp or *.mp4"),
+    (("--pairs", "3", "-o", "a.exr"), "a sheet of --pairs is *.png or *.jpg"),
+    (("--panel", "0,0,1,1,0.5"), "reaches into the object"),
+    (("--panel", "0,0,0,1,2"), "all above 0"),
+    (("--panel", "0,0,nan,1,2"), "expected finite"),
+    (("--pairs", "3", "--sweep", "view"), "exclude each other"),
+    (("--compare", "none.safetensors"), "none.safetensors: no such file"),
+])  # fmt: skip
+def test_what_cannot_be_drawn_is_refused_before_it_is_drawn(
+    options: tuple[str, ...], message: str, store: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    assert call("render", store, "--size", "8x8", *options) != 0
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert sorted(tmp_path.iterdir()) == before
+    existing = tmp_path / "wool.webp"
+    existing.write_bytes(b"mine")
+    assert call("render", store, "--sweep", "view", "-o", existing) == 1
+    assert existing.read_bytes() == b"mine"
