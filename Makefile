@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 KERNELS := $(wildcard btfkit/native/*.hpp btfkit/native/*/*.cpp btfkit/native/*/*.hpp)
 
-.PHONY: demo test test-quick check bench clean
+.PHONY: demo test test-quick check bench campaign wheel docs clean
 
 demo: $(STAMP)
 	$(BIN)/python examples/demo.py
@@ -21,6 +21,12 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Hours of hostile input, kills, full disks and random queries; what they tried adds up in docs/campaigns.md.
+# make campaign MINUTES=600 NAMES="readers kills"
+campaign: $(STAMP)
+	PYTHONPATH=tests:tests/devices:tests/export OMP_NUM_THREADS=1 BTFKIT_THREADS=1 \
+	  $(BIN)/python -W ignore -m campaigns $(NAMES) --minutes $(or $(MINUTES),60)
 
 bench: $(STAMP)
 	$(BIN)/btfkit bench

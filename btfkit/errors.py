@@ -52,9 +52,7 @@ class FormatError(BtfkitError):
     def __init__(
         self, path: str | os.PathLike[str], message: str, *, remedy: str | None = None
     ) -> None:
-        # One line, whatever a name in an archive or a foreign library says.
-        line = " ".join(f"{os.fspath(path)}: {message}".split())
-        super().__init__(line, remedy=remedy)
+        super().__init__(one_line(f"{os.fspath(path)}: {message}"), remedy=remedy)
         self.path = os.fspath(path)
 
 
@@ -68,6 +66,24 @@ class CalibrationError(BtfkitError):
 
 class FitError(BtfkitError):
     """A model cannot be fitted: no usable data, or training that diverges."""
+
+
+def one_line(text: str, most: int = 900) -> str:
+    """One printable line, whatever a name in an archive or a foreign library says.
+
+    Control characters, which a terminal would obey, are shown as escapes; the middle of what is
+    longer than `most` characters is left out.
+    """
+    line = " ".join(text.split())
+    line = printable(line)
+    return line if len(line) <= most else f"{line[: most * 2 // 3]} … {line[-most // 4 :]}"
+
+
+def printable(text: str) -> str:
+    """`text` with control characters, of which a terminal obeys some, as escapes."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> str:

@@ -161,8 +161,18 @@ def error_line(error: Exception) -> str:
     return _in_one(f"{type(error).__name__}: {error} (a fault in btfkit; --debug shows where)")
 
 
+def _shown(text: str) -> str:
+    """Text for a terminal: what would move its cursor or turn its letters around is escaped."""
+    from btfkit.errors import printable
+
+    return "\n".join(printable(line) for line in text.split("\n"))
+
+
 def _in_one(text: str) -> str:
-    return " ".join(text.split())
+    from btfkit.errors import one_line
+
+    # Remedies list what there is, and may be long.
+    return one_line(text, 2000)
 
 
 def _failed(kind: str, message: str, code: int) -> int:
@@ -181,13 +191,13 @@ def _is_ours(warning: warnings.WarningMessage) -> bool:
 def _say(outcome: Outcome, warned: list[str]) -> None:
     if not _manners.quiet:
         for message in warned:
-            print(f"btfkit: warning: {message}", file=sys.stderr)  # noqa: T201
+            print(f"btfkit: warning: {_shown(message)}", file=sys.stderr)  # noqa: T201
     if _manners.as_json:
         _print_json({**outcome.data, **({"warnings": warned} if warned else {})})
     else:
-        click.echo(outcome.line)
+        click.echo(_shown(outcome.line))
         if outcome.then and not _manners.quiet:
-            click.echo(f"next: {outcome.then}", err=True)
+            click.echo(f"next: {_shown(outcome.then)}", err=True)
     if "error" in outcome.data:
         print(f"btfkit: error: {outcome.data['error']['message']}", file=sys.stderr)  # noqa: T201
     _manners.code = outcome.code

@@ -30,9 +30,16 @@ def describe(name: str, data: bytes) -> Header:
     """What the header says; the fourth byte of 32-bit pixels is no colour and is left out.
 
     Raises:
-        FormatError: a colour space that is not understood.
+        FormatError: a colour space that is not understood, or pixels that lie in the header:
+            decoders read those from wherever they please.
     """
     h, w = size(data)
+    (pixels,), (length,) = struct.unpack_from("<I", data, 10), struct.unpack_from("<I", data, 14)
+    if not 14 + length <= pixels < len(data):
+        raise FormatError(
+            name, f"its pixels lie at byte {pixels} of {len(data)}; expected {14 + length} or later",
+            remedy="copy it again, or save it as PNG",
+        )  # fmt: skip
     return Header(h, w, colours=3, bits=8, declared=_declared(name, data))
 
 

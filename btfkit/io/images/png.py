@@ -103,7 +103,9 @@ def _declared(name: str, kept: dict[bytes, bytes], colours: int) -> Declared | N
     if b"cICP" in kept:
         return _coded(name, *struct.unpack_from("4B", kept[b"cICP"]))
     if b"iCCP" in kept:
-        profile = kept[b"iCCP"].split(b"\0", 1)[1]
+        _, ended, profile = kept[b"iCCP"].partition(b"\0")
+        if not ended:
+            raise ValueError("no name of a profile")
         unpacker = zlib.decompressobj()
         try:
             whole = unpacker.decompress(profile[1:], _MOST_PROFILE)

@@ -1,0 +1,60 @@
+"""Run campaigns and add what they tried to docs/campaigns.md: python -m campaigns [NAME…]."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+from campaigns import ledger, limits
+from campaigns.catalogue import CAMPAIGNS
+
+
+def main() -> int:
+    """Returns 1 where something was found."""
+    parser = argparse.ArgumentParser(prog="campaigns", description=__doc__)
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"of {', '.join(CAMPAIGNS)}; all by default"
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=60.0, help="in all, shared by the named ones"
+    )
+    parser.add_argument(
+        "--seeds", metavar="A:B", help="only these, not counted; by default those that come next"
+    )
+    parser.add_argument(
+        "--sample", action="store_true", help="from a seed of this day, not counted"
+    )
+    asked = parser.parse_args()
+    unknown = sorted(set(asked.names) - set(CAMPAIGNS))
+    if unknown:
+        parser.error(f"no campaign {unknown[0]!r}; there are {', '.join(CAMPAIGNS)}")
+    names = asked.names or list(CAMPAIGNS)
+    first, last = map(int, asked.seeds.split(":")) if asked.seeds else (None, None)
+    # Every day's sample looks elsewhere, far beyond the seeds that are counted.
+    day = 10**9 + int(time.time() // 86400) * 10**6
+    whole = sum(CAMPAIGNS[name].share for name in names)
+    found = 0
+    for name in names:
+        campaign = CAMPAIGNS[name]
+        start = first if first is not None else day if asked.sample else ledger.next_seed(name)
+        began = time.monotonic()
+        result = limits.run(
+            campaign.prepare, start, last, seconds=60 * asked.minutes * campaign.share / whole,
+            limit_s=campaign.limit_s, limit_bytes=campaign.limit_bytes,
+        )  # fmt: skip
+        said = ", ".join(f"{value} {key}" for key, value in sorted(result.counts.items()))
+        print(
+            f"{name} {start}:{result.next_seed}: {said}; {time.monotonic() - began:.0f} s",
+            flush=True,
+        )
+        for find in result.finds:
+            print(f"  FIND {name} seed {find['seed']}: {find['what']}", flush=True)
+        found += len(result.finds)
+        if not asked.sample and not asked.seeds:
+            ledger.add(name, start, result, time.monotonic() - began)
+    return bool(found)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
