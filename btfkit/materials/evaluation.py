@@ -49,6 +49,7 @@ def errors_on_btf(
     within_s: float | None = None,
     progress: Callable[[int, int], None] | None = None,
     gains: bool = False,
+    lpips: Callable[..., float] | None = None,
 ) -> dict[str, Any]:
     """Errors over whole textures.
 
@@ -61,6 +62,7 @@ def errors_on_btf(
         progress: called with (per mille done, 1000).
         gains: whether errors are told once more with a gain for each pair and channel taken out,
             found on one half of its texels and scored on the other (`btfkit.gains.crossed`).
+        lpips: a distance of pictures (`btfkit.lpips.LPIPS`) whose mean is told as `lpips`.
 
     Returns:
         mse, psnr, mse_log1p, psnr_log1p, mae, psnr_srgb (pooled over all texels), ssim_srgb and
@@ -82,7 +84,7 @@ def errors_on_btf(
         _seen(material, btf, int(pair), None if windows is None else windows[k])
         for k, pair in enumerate(chosen)
     )
-    found = _errors_of(pictures, len(chosen), within_s, progress, gains=gains)
+    found = _errors_of(pictures, len(chosen), within_s, progress, gains=gains, lpips=lpips)
     if windows is not None:
         found["window"] = [_WINDOW if side > _WINDOW else side for side in btf.shape[1:3]]
     return found
@@ -120,10 +122,11 @@ def _errors_of(
     progress: Callable[[int, int], None] | None,
     *,
     gains: bool = False,
+    lpips: Callable[..., float] | None = None,
 ) -> dict[str, Any]:
     """Errors of answers against truths, of as many of `count` as there is time for."""
-    pooled, pictured = metrics.Pooled(), metrics.Pictured()
-    freed, freely = metrics.Pooled(), metrics.Pictured()
+    pooled, pictured = metrics.Pooled(), metrics.Pictured(lpips)
+    freed, freely = metrics.Pooled(), metrics.Pictured(lpips)
     own: list[float] = []
     start, done = time.perf_counter(), 0
     for answer, truth in pictures:
