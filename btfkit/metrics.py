@@ -6,6 +6,7 @@ Definitions and sources: docs/metrics.md.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import final
 
@@ -77,10 +78,16 @@ class Pooled:
 @final
 @dataclass
 class Pictured:
-    """Means of what is defined on whole pictures: structural similarity and FLIP."""
+    """Means of what is defined on whole pictures: structural similarity, FLIP and LPIPS.
 
+    Attributes:
+        lpips: a distance of pictures of three channels, sRGB encoded; None leaves it out.
+    """
+
+    lpips: Callable[[Array, Array], float] | None = None
     _ssim: list[float] = field(default_factory=list)
     _flip: list[float] = field(default_factory=list)
+    _lpips: list[float] = field(default_factory=list)
 
     def add(self, answer: Array, truth: Array) -> None:
         """Count one picture (h, w, c) against another; texels not measured are made equal."""
@@ -90,10 +97,12 @@ class Pictured:
         self._ssim.append(ssim_srgb(answer, truth))
         if truth.shape[-1] == 3:
             self._flip.append(float(flip(answer, truth).mean()))
+        if self.lpips is not None:
+            self._lpips.append(self.lpips(to_srgb(answer), to_srgb(truth)))
 
     def errors(self) -> dict[str, float]:
-        """ssim_srgb and, for pictures of three channels, flip."""
-        found = {"ssim_srgb": self._ssim, "flip": self._flip}
+        """ssim_srgb and, for pictures of three channels, flip; lpips where weights are named."""
+        found = {"ssim_srgb": self._ssim, "flip": self._flip, "lpips": self._lpips}
         return {name: float(np.mean(values)) for name, values in found.items() if values}
 
 

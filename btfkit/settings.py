@@ -87,6 +87,14 @@ def _value(name: str, hint: Any, text: str) -> Any:
     return text
 
 
+def truth(name: str, text: str) -> bool:
+    """True or false of a setting's text; ValueError for anything else."""
+    try:
+        return _truth(text)
+    except ValueError:
+        raise ValueError(f"{name} = {text!r}; expected {_KINDS[bool]}") from None
+
+
 def _truth(text: str) -> bool:
     if text.lower() not in _TRUE + _FALSE:
         raise ValueError

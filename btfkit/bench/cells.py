@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,12 +14,15 @@ from btfkit import native
 from btfkit.bench import machine, measures
 from btfkit.bench.cases import Case
 from btfkit.fitting import CLOSED_FORM, TRAINED
+from btfkit.fitting.training import begun, closed_form
 from btfkit.materials.base import Material
 
 # Looks at the held-out error while a model is trained, evenly spread in the logarithm of time.
 _LOOKS = 7
 # A file name holds 255 bytes.
 _MOST_NAME = 150
+# Models that are run with gains, too: enough to see what gains do.
+_GAINED = ("lambert", "rainer19", "neumip")
 # The one model whose networks serve several materials.
 SHARED = "rainer20"
 
@@ -73,6 +75,7 @@ def cells_of(
     seed: int,
     rows: int | None,
     pictured: bool = True,
+    gains: bool = False,
 ) -> list[Cell]:
     """Every cell of a material: closed forms once a setting, trained models once a budget too.
 
@@ -80,11 +83,15 @@ def cells_of(
         material: its name. models, budgets, seed: of the profile.
         rows: of the data's grid; None where queries do not say.
         pictured: whether the data are pictures; models that need some refuse queries only once.
+        gains: whether models that can find gains are run once more to do so.
     """
     found = []
     wanted = tuple(budgets)
     for model in models:
-        for settings in _variants(model, rows, pictured=pictured):
+        variants = list(_variants(model, rows, pictured=pictured))
+        if gains and pictured and model in _GAINED:
+            variants.append({"gains": "true"})
+        for settings in variants:
             times = wanted if model in TRAINED else (None,)
             # A variant is one more point of a curve; the longest budget says enough.
             times = times[-1:] if settings and model in TRAINED else times
@@ -184,8 +191,7 @@ def _head(cell: Cell) -> dict[str, Any]:
 
 def _closed_form(cell: Cell, case: Case) -> tuple[Material, _Ran]:
     start, cpu = time.perf_counter(), time.process_time()
-    fitted = _load(CLOSED_FORM[cell.model])
-    material: Material = fitted(case.train, settings=dict(cell.settings), progress=None)
+    material, _ = closed_form(case.train, cell.model, cell.settings, seed=cell.seed)
     spent = time.perf_counter() - start, time.process_time() - cpu
     return material, _Ran(*spent, 1, case.samples)
 
@@ -199,15 +205,11 @@ def _trainable(cell: Cell, cases: Sequence[Case]) -> tuple[Any, Any]:
     torch.set_num_threads(native.threads())
     first, *others = (case.train for case in cases)
     generators = Generators(cell.seed)
-    trainable = _load(TRAINED[cell.model])(
-        first,
-        np.arange(len(first)),
-        np.arange(0),
-        settings=dict(cell.settings),
-        generators=generators,
-        progress=None,
-        **({"others": others} if others else {}),
-    )
+    more: dict[str, Any] = {"others": others} if others else {}
+    trainable = begun(
+        first, cell.model, np.arange(len(first)), np.arange(0), cell.settings, generators,
+        progress=None, **more,
+    )  # fmt: skip
     return trainable, generators
 
 
@@ -241,8 +243,3 @@ def _train(
 
 def _point(run: Any, errors: dict[str, float]) -> dict[str, float]:
     return {"cpu_s": run.cpu_s, "steps": run.done, **errors}
-
-
-def _load(home: str) -> Any:
-    module, name = home.split(":")
-    return getattr(importlib.import_module(module), name)

@@ -193,7 +193,7 @@ def _run_missing(profile: Profile, folder: Path, progress: Progress | None) -> N
         cells_of(
             name_of(source), profile.models, profile.budgets_cpu_s, seed=profile.seed,
             rows=profile.size if isinstance(source, str) else rows_of(source),
-            pictured=source in pictured,
+            pictured=source in pictured, gains=profile.measured,
         )
         for source in profile.sources
     ]  # fmt: skip

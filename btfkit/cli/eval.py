@@ -15,6 +15,7 @@ from btfkit.remote import Location
 
 if TYPE_CHECKING:
     from btfkit.btf import BTF
+    from btfkit.lpips import LPIPS
     from btfkit.materials.base import Material
     from btfkit.queries import QuerySet
 
@@ -23,7 +24,17 @@ if TYPE_CHECKING:
 @click.argument("model", type=click.Path(path_type=Path))
 @click.argument("source", type=LocationType())
 @click.option("--all", "everything", is_flag=True, help="All pairs, those trained on as well.")
-def eval_verb(bar: Bar, *, model: Path, source: Location, everything: bool) -> Outcome:
+@click.option(
+    "--gains", is_flag=True,
+    help="Also with a gain for each pair taken out; of a model fitted with gains always.",
+)  # fmt: skip
+@click.option(
+    "--lpips", "weights", type=click.Path(path_type=Path), metavar="WEIGHTS",
+    help="LPIPS too, by these weights (safetensors; docs/metrics.md).",
+)  # fmt: skip
+def eval_verb(
+    bar: Bar, *, model: Path, source: Location, everything: bool, gains: bool, weights: Path | None
+) -> Outcome:
     """Errors of MODEL on SOURCE, a BTF or a query file with answers.
 
     On the data that MODEL was fitted to, only what the fit held out is compared, unless --all
@@ -34,6 +45,11 @@ def eval_verb(bar: Bar, *, model: Path, source: Location, everything: bool) -> O
     from btfkit.heldout import held_out
     from btfkit.relief.relief import Relief
 
+    distance = None
+    if weights is not None:
+        from btfkit.lpips import LPIPS
+
+        distance = LPIPS(weights)
     bar.phase("reading")
     material, truth = sources.material(model), sources.measured(source)
     if isinstance(truth, Relief):
@@ -50,23 +66,40 @@ def eval_verb(bar: Bar, *, model: Path, source: Location, everything: bool) -> O
         )
     rows = None if everything or test is None else test
     bar.phase("evaluating")
-    errors = _errors(material, truth, rows, bar)
+    errors = _errors(material, truth, rows, bar, gains=gains, lpips=distance)
     errors |= _carried(model, material, truth, rows, test, errors)
     which = _which(material, truth, rows, test)
     line = "  ".join(f"{k} {v:.6g}" for k, v in errors.items() if isinstance(v, (int, float)))
     data: dict[str, Any] = {"model": model, "source": source, "which": which, **errors}
+    if distance is not None:
+        data["lpips_weights"] = {"network": distance.network, "sha256": distance.sha256}
     if test is not None:
         data["held_out"] = test
     then = f"btfkit render {shlex.quote(str(model))} --shape sphere"
     return Outcome(f"{which}\n{line}", data, then=then)
 
 
-def _errors(material: Material, truth: BTF | QuerySet, rows: Any, bar: Bar) -> dict[str, Any]:
+def _errors(
+    material: Material,
+    truth: BTF | QuerySet,
+    rows: Any,
+    bar: Bar,
+    *,
+    gains: bool,
+    lpips: LPIPS | None,
+) -> dict[str, Any]:
     from btfkit.btf import BTF
     from btfkit.materials import evaluation
 
     if isinstance(truth, BTF):
-        return evaluation.errors_on_btf(material, truth, pairs=rows, progress=bar)
+        fitted = material.header.provenance.get("settings", {}).get("gains", "")
+        found = gains or str(fitted).lower() == "true"
+        return evaluation.errors_on_btf(
+            material, truth, pairs=rows, progress=bar, gains=found, lpips=lpips
+        )
+    for name, given in (("--gains", gains), ("--lpips", lpips)):
+        if given:
+            raise ValueError(f"{name} is for the pictures of a BTF; queries have none")
     return evaluation.errors_on_queries(material, truth if rows is None else truth.subset(rows))
 
 

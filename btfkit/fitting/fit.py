@@ -27,7 +27,7 @@ from btfkit.materials.base import Material
 from btfkit.materials.evaluation import errors_on_btf, errors_on_queries
 from btfkit.queries import QuerySet
 from btfkit.relief.relief import Relief
-from btfkit.settings import as_text
+from btfkit.settings import as_text, truth
 
 _DEVICES = ("auto", "cpu", "cuda")
 
@@ -97,6 +97,8 @@ def fit(
     if chosen in CLOSED_FORM:
         train = split(len(data), holdout, seed)[0]
         material, run = solved(data.subset(train), chosen, given, plan, progress)
+        if "gains.pairs" in run.training:
+            run = replace(run, training={**run.training, "gains.pairs": train})
     else:
         material, run = trained(data, chosen, given, plan, phases, progress, relief, teacher)
     if phases.late():
@@ -118,9 +120,11 @@ def fit(
     errors: Mapping[str, Any] = {}
     try:
         limit = None if full_report else phases.evaluating_s()
-        errors = _errors(material, data, plan, limit, progress)
-        if run.stated and "psnr" in errors:
-            errors = {**errors, "psnr_own": errors["psnr"], **run.stated}
+        gains = truth("gains", given.get("gains", "false"))
+        errors = _errors(material, data, plan, limit, progress, gains=gains)
+        if "psnr_carried" in run.stated and "psnr" in errors:
+            errors = {**errors, "psnr_own": errors["psnr"]}
+        errors = {**errors, **run.stated}
     except KeyboardInterrupt:
         choice = (*choice, "not evaluated, because interrupted: btfkit eval does it")
     phases.end()
@@ -242,6 +246,8 @@ def _errors(
     plan: Plan,
     limit_s: float | None,
     progress: Progress | None,
+    *,
+    gains: bool,
 ) -> Mapping[str, Any]:
     """Held-out errors; of a BTF, of as many pairs as there is time for, in random order."""
     test = split(len(source), plan.holdout, plan.seed)[1]
@@ -251,7 +257,9 @@ def _errors(
         return errors_on_queries(material, source.subset(test))
     if limit_s is not None:
         test = np.random.default_rng([plan.seed, 0xE7A1]).permutation(test)
-    return errors_on_btf(material, source, pairs=test, within_s=limit_s, progress=progress)
+    return errors_on_btf(
+        material, source, pairs=test, within_s=limit_s, progress=progress, gains=gains
+    )
 
 
 def _report(

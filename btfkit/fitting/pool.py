@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from btfkit import native
 from btfkit.btf import BTF
 from btfkit.errors import FitError
+from btfkit.fitting.gains import GainedTextures
 from btfkit.textures import HALF_RANGE
 
 DEFAULT_BYTES = 1 << 30
@@ -64,6 +65,10 @@ class Pool:
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
         self._btf, self._all, self._seed = btf, pairs, seed
+        textures = btf.textures
+        self._gained = textures if isinstance(textures, GainedTextures) else None
+        # Gains change while textures lie here: who draws from them multiplies by `factors`.
+        self._read = btf.batch if self._gained is None else self._gained.measured
         one = int(np.prod(btf.shape[1:])) * 2
         count = int(np.clip(most_bytes // one, 1, len(pairs)))
         self.whole = count == len(pairs)
@@ -79,6 +84,12 @@ class Pool:
         if self._worker:
             # A first part lies ready when the first step asks for it.
             self._coming = self._worker.submit(self._decode, len(self.pairs))
+
+    def factors(self, pairs: NDArray[np.intp]) -> NDArray[np.float32] | None:
+        """(k, c) what textures of pairs are to be multiplied by, one over their gains as they
+        stand; None where there are no gains.
+        """
+        return None if self._gained is None else 1 / self._gained.values[pairs]
 
     def at_step(self, step: int) -> None:
         """Bring the pool to what it holds at `step`; a resumed run may jump ahead."""
@@ -120,7 +131,7 @@ class Pool:
         return joined[start : start + count]
 
     def _decode(self, first: int) -> NDArray[np.float32]:
-        return self._btf.batch(self._sequence(first, self._quota))
+        return self._read(self._sequence(first, self._quota))
 
     def _jump(self, due: int) -> None:
         self._moved = due
@@ -137,7 +148,7 @@ class Pool:
         parts = [self.pairs[at : at + _BATCH] for at in range(0, len(self.pairs), _BATCH)]
         filled = 0
         with ThreadPoolExecutor(native.threads()) as workers:
-            for batch in _ahead(workers, self._btf.batch, parts):
+            for batch in _ahead(workers, self._read, parts):
                 finite = np.isfinite(batch)
                 self.masked += int((~finite).any(axis=-1).sum())
                 if images.dtype == np.float16 and (np.abs(batch) > HALF_RANGE).any(where=finite):

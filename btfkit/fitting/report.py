@@ -74,8 +74,8 @@ class FitReport:
         )
         if self.interrupted:
             line += "; interrupted"
-        return "\n  ".join([line, *(f"not trained: {part}" for part in self.untrained),
-                            *self.choice])  # fmt: skip
+        return "\n  ".join([line, *self._gains(), *(f"not trained: {part}"
+                            for part in self.untrained), *self.choice])  # fmt: skip
 
     def write(self, path: Path) -> None:
         """Write it as JSON, with the material's header."""
@@ -83,6 +83,19 @@ class FitReport:
         text = json.dumps(plain({**self.as_dict(), "header": header}), indent=1)
         with whole(path, force=True) as partial:
             partial.write_text(text)
+
+    def _gains(self) -> list[str]:
+        """Of gains, where they were looked for: what they take out of the error, and what not."""
+        found, psnr = self.errors.get("gains"), self.errors.get("psnr_gains")
+        if not found or psnr is None:
+            return []
+        percent = ", ".join(f"{100 * part:.1f}" for part in found["deviation"])
+        left = ", ".join(f"{100 * part:.1f}" for part in found["smooth"])
+        return [
+            f"gains: with a held-out pair's own gain {psnr:.2f} dB; gains vary by {percent} %; "
+            f"{left} % change slowly with light and view, are not told from reflectance and "
+            f"stay in it"
+        ]
 
     def _error(self) -> str:
         psnr = self.errors.get("psnr")

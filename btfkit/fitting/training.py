@@ -5,22 +5,26 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, cast, final
 
+import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.files import room_for
-from btfkit.fitting import CLOSED_FORM, TRAINED, loaded
+from btfkit.fitting import CLOSED_FORM, TRAINED, gains, loaded
 from btfkit.fitting.phases import Phases
 from btfkit.fitting.saving import state_file
 from btfkit.heldout import split
 from btfkit.materials.base import Material
 from btfkit.queries import QuerySet
 from btfkit.relief.relief import Relief
+
+if TYPE_CHECKING:
+    from btfkit.fitting.loop import Trainable
 
 Progress = Callable[[int, int], None]
 
@@ -69,10 +73,54 @@ def solved(
     if plan.out is not None and model == "interpolation":
         room_for(plan.out, 2 * _values(source), what="an interpolation of these data")
     start, cpu = time.perf_counter(), time.process_time()
-    function = loaded(CLOSED_FORM[model])
-    material: Material = function(source, settings=settings, progress=progress)
+    material, found = closed_form(source, model, settings, seed=plan.seed, progress=progress)
     seconds = time.perf_counter() - start, time.process_time() - cpu
-    return material, Ran(*seconds, 1, _samples(source))
+    ran = Ran(*seconds, 1, _samples(source))
+    if found is not None:
+        ran = replace(ran, training=found.arrays(), stated=found.stated())
+    return material, ran
+
+
+def closed_form(
+    source: BTF | QuerySet,
+    model: str,
+    settings: Mapping[str, str],
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[Material, gains.Found | None]:
+    """The material of a closed form, and the gains where `gains=true` asks for them."""
+    function = loaded(CLOSED_FORM[model])
+    own = gains.without(settings)
+    if gains.wanted(settings, model, source):
+        btf = cast(BTF, source)
+        return gains.solved(function, btf, settings=own, progress=progress, seed=seed)
+    return function(source, settings=own, progress=progress), None
+
+
+def begun(
+    source: BTF | QuerySet,
+    model: str,
+    train: NDArray[np.intp],
+    test: NDArray[np.intp],
+    settings: Mapping[str, str],
+    generators: Any,
+    **more: Any,
+) -> Trainable:
+    """What is trained: the model's own trainable, with gains where `gains=true` asks for them.
+
+    Args:
+        generators: `loop.Generators`. more: what the trainable takes beside.
+    """
+    from btfkit.fitting import gains
+    from btfkit.fitting.alternating import Gained
+
+    finds = gains.wanted(settings, model, source)
+    data = gains.prepared(cast(BTF, source), generators.seed) if finds else source
+    trainable: Trainable = loaded(TRAINED[model])(
+        data, train, test, settings=gains.without(settings), generators=generators, **more
+    )
+    return Gained(trainable, gains.Found(cast(BTF, data), train)) if finds else trainable
 
 
 def trained(
@@ -103,8 +151,8 @@ def trained(
     if isinstance(source, QuerySet):
         phases.begin("starting")
     train, test = split(len(source), plan.holdout, plan.seed)
-    trainable: loop.Trainable = loaded(TRAINED[model])(
-        source, train, test, settings=settings, generators=generators,
+    trainable = begun(
+        source, model, train, test, settings, generators,
         progress=phases.reading(progress), **({} if teacher is None else {"teacher": teacher}),
     )  # fmt: skip
     if relief is not None:

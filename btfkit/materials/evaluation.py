@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from btfkit import gains as nuisance
 from btfkit import metrics
 from btfkit.btf import BTF
 from btfkit.footprint import level_of
@@ -47,6 +48,8 @@ def errors_on_btf(
     pairs: ArrayLike | None = None,
     within_s: float | None = None,
     progress: Callable[[int, int], None] | None = None,
+    gains: bool = False,
+    lpips: Callable[..., float] | None = None,
 ) -> dict[str, Any]:
     """Errors over whole textures.
 
@@ -57,12 +60,16 @@ def errors_on_btf(
         within_s: seconds after which no further pair is taken; at least one is, and of large
             textures a window at random stands for each. None takes all of everything.
         progress: called with (per mille done, 1000).
+        gains: whether errors are told once more with a gain for each pair and channel taken out,
+            found on one half of its texels and scored on the other (`btfkit.gains.crossed`).
+        lpips: a distance of pictures (`btfkit.lpips.LPIPS`) whose mean is told as `lpips`.
 
     Returns:
         mse, psnr, mse_log1p, psnr_log1p, mae, psnr_srgb (pooled over all texels), ssim_srgb and
         flip (means over pairs), mean_psnr (mean over pairs of each pair's own, but of
         `exact_pairs`, whose own is infinite; None where no other is left), pairs that were
-        compared, of_pairs, masked; where windows were compared, `window`, its height and width.
+        compared, of_pairs, masked; where windows were compared, `window`, its height and width;
+        with `gains` all errors but mean_psnr once more, as `mse_gains` and so on.
 
     Raises:
         ValueError: channels differ, or nothing is measured.
@@ -77,7 +84,7 @@ def errors_on_btf(
         _seen(material, btf, int(pair), None if windows is None else windows[k])
         for k, pair in enumerate(chosen)
     )
-    found = _errors_of(pictures, len(chosen), within_s, progress)
+    found = _errors_of(pictures, len(chosen), within_s, progress, gains=gains, lpips=lpips)
     if windows is not None:
         found["window"] = [_WINDOW if side > _WINDOW else side for side in btf.shape[1:3]]
     return found
@@ -113,14 +120,22 @@ def _errors_of(
     count: int,
     within_s: float | None,
     progress: Callable[[int, int], None] | None,
+    *,
+    gains: bool = False,
+    lpips: Callable[..., float] | None = None,
 ) -> dict[str, Any]:
     """Errors of answers against truths, of as many of `count` as there is time for."""
-    pooled, pictured = metrics.Pooled(), metrics.Pictured()
+    pooled, pictured = metrics.Pooled(), metrics.Pictured(lpips)
+    freed, freely = metrics.Pooled(), metrics.Pictured(lpips)
     own: list[float] = []
     start, done = time.perf_counter(), 0
     for answer, truth in pictures:
         pooled.add(answer, truth)
         pictured.add(answer, truth)
+        if gains:
+            with_gains = nuisance.crossed(answer, truth)
+            freed.add(with_gains, truth)
+            freely.add(with_gains, truth)
         measured = np.isfinite(truth)
         if measured.any():
             own.append(metrics.psnr(float(np.square(answer - truth)[measured].mean())))
@@ -133,6 +148,7 @@ def _errors_of(
         if within_s is not None and pooled.values and spent * (done + 1) / done > within_s:
             break
     finite = [value for value in own if math.isfinite(value)]
+    apart = {**freed.errors(), **freely.errors()} if gains else {}
     return {
         **pooled.errors(),
         **pictured.errors(),
@@ -141,6 +157,7 @@ def _errors_of(
         "pairs": done,
         "of_pairs": count,
         "masked": pooled.masked,
+        **{f"{key}_gains": value for key, value in apart.items()},
     }
 
 

@@ -289,12 +289,21 @@ class NeuBTFPaper(Trainable):
     def _targets(self, slots: Tensor, rows: Tensor, cols: Tensor) -> Tensor:
         """(k, m, c) measured values of pool images at shared texels."""
         images = torch.from_numpy(self._pool.images)
-        return images[slots[:, None], rows[None], cols[None]].float()
+        values = images[slots[:, None], rows[None], cols[None]].float()
+        factors = self._factors(slots)
+        return values if factors is None else values * factors[:, None]
 
     def _images(self, slots: Tensor, window: Window) -> Tensor:
         """(k, c, crop h, crop w) windows of pool images."""
         images = torch.from_numpy(self._pool.images[slots.numpy()]).float().permute(0, 3, 1, 2)
+        if (factors := self._factors(slots)) is not None:
+            images = images * factors[..., None, None]
         return self._guides.windowed(images, window)
+
+    def _factors(self, slots: Tensor) -> Tensor | None:
+        """(k, c) that pool images are to be multiplied by; None where there are no gains."""
+        factors = self._pool.factors(self._pool.pairs[slots.numpy()])
+        return None if factors is None else torch.from_numpy(factors)
 
     def _predict(
         self,

@@ -48,9 +48,10 @@ class Batch:
 @final
 @dataclass(frozen=True, eq=False)
 class Share:
-    """Rows start..stop of a batch, drawn from images with `seed`; None is a blur of 0.5."""
+    """Rows start..stop of a batch, drawn from images of `pairs` with `seed`; blur None is 0.5."""
 
     images: Images
+    pairs: NDArray[np.intp]
     blur: Array | None
     seed: int
     start: int
@@ -104,6 +105,8 @@ class TexelSource(Source):
         for share in self.shares(step, count):
             part = out.part(share.start, share.stop)
             draw(share.images, share.seed, part)
+            if (factors := self._pool.factors(share.pairs)) is not None:
+                part.target[...] *= factors[part.slots]
             blur = 0.5 if share.blur is None else share.blur[part.slots]
             footprint[share.start : share.stop] = blur
         blurred = footprint if self._coarse else None
@@ -126,11 +129,11 @@ class TexelSource(Source):
         at, found = count, []
         seed = int(np.random.SeedSequence([self._seed, step]).generate_state(1, np.uint64)[0])
         seed >>= 1  # room for one number a query
-        for level, (images, blur) in enumerate(self._coarse):
+        for level, (images, blur, pairs) in enumerate(self._coarse):
             share = max(at // 2, 1) if level == 0 else max(at // 3, 1)
-            found.append(Share(images, blur, seed ^ (level + 1) << 40, at - share, at))
+            found.append(Share(images, pairs, blur, seed ^ (level + 1) << 40, at - share, at))
             at -= share
-        return [*found, Share(self._images(), None, seed, 0, at)]
+        return [*found, Share(self._images(), self._pool.pairs, None, seed, 0, at)]
 
     def held_out(self) -> Batch:
         rng = np.random.default_rng([self._seed, 7])
@@ -175,10 +178,10 @@ class TexelSource(Source):
         edges = [0.0 if position is None else texel for position in near]
         return Images(values, phase, table[0], table[1], grid, stride, edges[0], edges[1])
 
-    def _coarser(self, level: Level) -> tuple[Images, Array]:
+    def _coarser(self, level: Level) -> tuple[Images, Array, NDArray[np.intp]]:
         pairs, grid = self._pool.pairs[level.slots], self._btf.shape[1:3]
         images = self._with_directions(level.values, level.phase, level.stride, pairs, grid)
-        return images, level.blur
+        return images, level.blur, pairs
 
 
 @final

@@ -96,7 +96,9 @@ class ProbedTexels:
         """(k, t, c) measured values under the pairs in `slots`; NaN where not measured."""
         rows, cols = texels // self._btf.shape[2], texels % self._btf.shape[2]
         images = torch.from_numpy(self._pool.images)
-        return images[slots[:, None], rows[None], cols[None]].float()
+        values = images[slots[:, None], rows[None], cols[None]].float()
+        factors = self._pool.factors(self.pairs_of(slots))
+        return values if factors is None else values * torch.from_numpy(factors)[:, None]
 
     def probed(self, texels: Tensor, probes: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Values (t, k, c) of texels under probes, and their light and view (t or 1, k, 2)."""
