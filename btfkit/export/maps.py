@@ -108,7 +108,9 @@ def materialx(
     notes = [f"licence: {licence}"] if licence else []
     if size_mm:
         notes.append(f"one tile is {size_mm[0]:g} mm x {size_mm[1]:g} mm")
-    about = html.escape("; ".join(["baked by btfkit", *notes]), quote=True)
+    # XML has no way to write most characters that control terminals.
+    said = "".join(c for c in "; ".join(["baked by btfkit", *notes]) if c.isprintable())
+    about = html.escape(said, quote=True)
     lines = [
         '<?xml version="1.0"?>',
         f'<materialx version="1.39" colorspace="lin_rec709" doc="{about}">',

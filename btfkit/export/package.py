@@ -11,7 +11,7 @@ from typing import Any
 
 from btfkit import jsonvalues
 from btfkit.btf import COLOUR
-from btfkit.export import ASKED, TARGETS, blender
+from btfkit.export import ASKED, TARGETS
 from btfkit.export.arrays import refuse_unknown
 from btfkit.files import whole_folder
 from btfkit.materials.base import Material
@@ -57,8 +57,10 @@ def export(
         (folder / "about.json").write_text(json.dumps(jsonvalues.plain(said), indent=1) + "\n")
         (folder / PREVIEW).write_bytes(studio.picture(material))
     if target == "blender":
+        from btfkit.export.blender import build
+
         # Where it lies now, since shaders know their textures by whole paths.
-        blender.build(Path(out))
+        build(Path(out))
     files = {str(path.relative_to(out)): path.stat().st_size
              for path in sorted(Path(out).rglob("*")) if path.is_file()}  # fmt: skip
     return {**said, "files": files, "bytes": sum(files.values())}
