@@ -375,7 +375,9 @@ def test_the_exported_scene_is_rendered_by_its_own_program(tmp_path: Path) -> No
         pytest.skip(amiss)
     export(made("lambert"), "mitsuba", tmp_path / "out")
     subprocess.run([sys.executable, tmp_path / "out" / "render.py", "4"], check=True)
-    picture = images.decode("render.exr", (tmp_path / "out" / "render.exr").read_bytes(), transfer="linear")
+    picture = images.decode(
+        "render.exr", (tmp_path / "out" / "render.exr").read_bytes(), transfer="linear"
+    )
     assert picture.linear.shape[:2] == (240, 320)
     # The ball before the sky, and a floor that is lit.
     middle, sky = picture.linear[100:140, 140:180], picture.linear[:20]
