@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from btfkit.cli.bar import Bar
-from btfkit.cli.options import LocationType
+from btfkit.cli.options import LocationType, force_option, stem
 from btfkit.cli.outcome import Outcome, verb
 from btfkit.remote import Location
 
@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from btfkit.lpips import LPIPS
     from btfkit.materials.base import Material
     from btfkit.queries import QuerySet
+
+
+# What --report says without a name.
+_HERE = "-"
 
 
 @verb("eval", example="btfkit eval wool.neubtf.safetensors wool.btf.zarr --json")
@@ -32,8 +36,21 @@ if TYPE_CHECKING:
     "--lpips", "weights", type=click.Path(path_type=Path), metavar="WEIGHTS",
     help="LPIPS too, by these weights (safetensors; docs/metrics.md).",
 )  # fmt: skip
+@click.option(
+    "--report", is_flag=False, flag_value=_HERE, metavar="[OUT.html]",
+    help="Also a page: errors by angle and texel, worst pairs, channels.",
+)  # fmt: skip
+@force_option
 def eval_verb(
-    bar: Bar, *, model: Path, source: Location, everything: bool, gains: bool, weights: Path | None
+    bar: Bar,
+    *,
+    model: Path,
+    source: Location,
+    everything: bool,
+    gains: bool,
+    weights: Path | None,
+    report: str | None,
+    force: bool,
 ) -> Outcome:
     """Errors of MODEL on SOURCE, a BTF or a query file with answers.
 
@@ -45,6 +62,7 @@ def eval_verb(
     from btfkit.heldout import held_out
     from btfkit.relief.relief import Relief
 
+    final = _report_name(report, model, force=force)
     distance = None
     if weights is not None:
         from btfkit.lpips import LPIPS
@@ -75,8 +93,42 @@ def eval_verb(
         data["lpips_weights"] = {"network": distance.network, "sha256": distance.sha256}
     if test is not None:
         data["held_out"] = test
+    if final is not None:
+        bar.phase("report")
+        data["report"] = _reported(final, material, truth, rows, data, bar, force=force)
+        line += f"\n{final}"
     then = f"btfkit render {shlex.quote(str(model))} --shape sphere"
     return Outcome(f"{which}\n{line}", data, then=then)
+
+
+def _report_name(report: str | None, model: Path, *, force: bool) -> Path | None:
+    """Where the page goes; refused before anything is evaluated."""
+    from btfkit.files import refuse_existing
+
+    if report is None:
+        return None
+    final = Path(f"{stem(model)}.eval.html" if report == _HERE else report)
+    if final.suffix.lower() not in (".html", ".htm"):
+        raise click.UsageError(f"--report {final}: a page is *.html; name it, or put --report last")
+    return refuse_existing(final, force=force)
+
+
+def _reported(
+    final: Path, material: Material, truth: BTF | QuerySet, rows: Any, said: dict[str, Any],
+    bar: Bar, *, force: bool,
+) -> Path:  # fmt: skip
+    from btfkit.btf import BTF
+    from btfkit.files import whole
+    from btfkit.view import report
+
+    figures = {k: v for k, v in said.items() if k not in ("held_out", "levels")}
+    text = report.page(
+        material, title=f"{stem(said['model'])}: errors", figures=figures,
+        btf=truth if isinstance(truth, BTF) else None, pairs=rows, progress=bar,
+    )  # fmt: skip
+    with whole(final, force=force) as partial:
+        partial.write_text(text, encoding="utf-8")
+    return final
 
 
 def _errors(

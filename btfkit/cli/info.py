@@ -71,9 +71,12 @@ def described(path: Location) -> dict[str, Any]:
 
     kind = sources.kind_of(path)
     if kind == "model" and isinstance(path, Path):
+        from btfkit.materials.explained import explained
         from btfkit.materials.file import header_of
 
-        return {"kind": kind, "bytes": path.stat().st_size, **header_of(path)}
+        header = header_of(path)
+        made = explained(sources.material(path))
+        return {"kind": kind, "bytes": path.stat().st_size, "made_of": made, **header}
     found = sources.measured(path)
     if isinstance(found, BTF):
         return {"kind": kind, "path": path, **_of_btf(found)}

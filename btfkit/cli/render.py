@@ -146,8 +146,8 @@ def render_verb(
 
 
 def _still(
-    source: Location, material: Material, shot: Shot, look: _Look, final: Path, bar: Bar, force: bool,
-    start: float,
+    source: Location, material: Material, shot: Shot, look: _Look, final: Path, bar: Bar,
+    force: bool, start: float,
 ) -> Outcome:  # fmt: skip
     from btfkit.render import picture, studio
 
@@ -178,8 +178,8 @@ def _still(
 
 
 def _comparison(
-    source: Location, material: Material, compare: Location, shot: Shot, look: _Look, final: Path, bar: Bar,
-    force: bool,
+    source: Location, material: Material, compare: Location, shot: Shot, look: _Look,
+    final: Path, bar: Bar, force: bool,
 ) -> dict[str, Any]:  # fmt: skip
     """Writes two materials side by side and their difference; the figures."""
     from dataclasses import replace

@@ -16,8 +16,18 @@ from btfkit.remote import Location
 @click.argument("source", metavar="MODEL_OR_BTF", type=LocationType())
 @out_option("*.html; by default the source's name with .html, here")
 @click.option("--small", is_flag=True, help="Textures of a model in 8 bits: half the bytes.")
+@click.option("--measured", metavar="BTF", type=LocationType(),
+              help="Of a model: a slider between it and this measurement.")  # fmt: skip
 @force_option
-def view_verb(bar: Bar, *, source: Location, out: Path | None, small: bool, force: bool) -> Outcome:
+def view_verb(
+    bar: Bar,
+    *,
+    source: Location,
+    out: Path | None,
+    small: bool,
+    measured: Location | None,
+    force: bool,
+) -> Outcome:
     """One self-contained page: a model on shapes to turn and light, or a BTF pair by pair.
 
     Nothing is loaded from a network; the page may be mailed, or opened from a disc.
@@ -35,8 +45,13 @@ def view_verb(bar: Bar, *, source: Location, out: Path | None, small: bool, forc
     refuse_existing(final, force=force)
     found = sources.read(source)
     title = stem(source)
+    truth = None if measured is None else sources.measured(measured)
+    if truth is not None and not isinstance(truth, BTF):
+        raise FormatError(str(measured), "has no textures to lay beside a model; expected a BTF")
     if isinstance(found, Material):
-        kind, text = "model", model.page(found, title=title, small=small)
+        kind, text = "model", model.page(found, title=title, small=small, measured=truth)
+    elif truth is not None:
+        raise ValueError(f"--measured is for the page of a model; {source} is none")
     elif isinstance(found, BTF):
         kind, text = "btf", store.page(found, title=title, progress=bar)
     else:

@@ -293,14 +293,14 @@ class Material(ABC):
         opacity = np.ones(b, np.float32)
         if not self._keeps_views():
             for light, answer in zip(lights, rgb, strict=True):
-                rows = np.flatnonzero(light.any(axis=1))
-                if rows.size:
-                    parts = (uv[rows], light[rows], view[rows], footprint[rows], curvature[rows])
-                    answer[rows], opacity[rows] = self.evaluate(*parts)
+                lit = np.flatnonzero(light.any(axis=1))
+                if lit.size:
+                    parts = (uv[lit], light[lit], view[lit], footprint[lit], curvature[lit])
+                    answer[lit], opacity[lit] = self.evaluate(*parts)
             return Response(rgb, opacity)
         query, _ = queries.flatten(uv, np.asarray([0, 0, 1]), view, footprint, curvature)
         ready = self._ready(query, opacity, below=True)
-        rows = slice(None) if ready.rows is None else ready.rows
+        rows: Any = slice(None) if ready.rows is None else ready.rows
         own = np.ascontiguousarray(lights[:, rows])
         values, found = self._answer_lights(_spread(ready)._replace(light=own))
         if found is not None:

@@ -247,7 +247,10 @@ class _Painter:
         together = len(sources) if shared else 1
         for first in range(0, count, points):
             at = slice(first, first + points)
-            part = Surface(*(row[at] for row in surface)), Gaze(*(row[at] for row in seen))
+            part = (
+                Surface._make(row[at] for row in surface),
+                Gaze._make(row[at] for row in seen),
+            )
             own = [(way[at], weight[at]) for way, weight in drawn]
             for start in range(0, len(sources), together):
                 light, cover = self._under(*part, sources[start : start + together], own)
@@ -260,10 +263,10 @@ class _Painter:
         self, surface: Surface, seen: Gaze, numbers: Floats
     ) -> list[tuple[Floats, Floats]]:
         """Directions (m, 3) and weights (m, 1 or c) of lights that differ from point to point."""
-        drawn = [
-            panel.sample((numbers + k * STEP) % 1, surface.point)
-            for k, panel in enumerate(self._scene.panels, 1)
-        ]
+        drawn: list[tuple[Floats, Floats]] = []
+        for k, panel in enumerate(self._scene.panels, 1):
+            own: Floats = (numbers + float(k) * STEP) % 1
+            drawn.append(panel.sample(own, surface.point))
         if self._scene.environment is not None:
             drawn.append(self._scene.environment.sample(numbers, seen.frame[:, 2]))
         return drawn

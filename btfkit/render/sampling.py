@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.floating]
 # The root of g³ = g + 1: multiples of 1/g and 1/g² fill the square evenly.
 _PLASTIC = 1.3247179572447460
-STEP = np.array([1 / _PLASTIC, 1 / _PLASTIC**2])
+STEP: Floats = np.array([1 / _PLASTIC, 1 / _PLASTIC**2])
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX = (
     (np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)),

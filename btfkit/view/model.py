@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from btfkit.btf import BTF
 from btfkit.export.arrays import refuse_unknown
 from btfkit.export.glsl import drawable, encoded, rgb
 from btfkit.export.package import about
 from btfkit.export.sections import filled, whole_text
 from btfkit.materials.base import Material
+from btfkit.view import slices
 from btfkit.view.page import composed, in_script, section
 
 
-def page(material: Material, *, title: str, small: bool = False) -> str:
+def page(
+    material: Material, *, title: str, small: bool = False, measured: BTF | None = None
+) -> str:
     """One HTML page, which draws a material on simple shapes by WebGL2.
 
     Args:
         material: one that has a program.
         title: shown, and escaped.
         small: textures as bytes between the ends of each channel instead of half floats.
+        measured: of which some textures lie behind a slider.
 
     Raises:
         TypeError: the material has no program.
@@ -33,6 +38,7 @@ def page(material: Material, *, title: str, small: bool = False) -> str:
         "grid": [w, h],
         "leveled": program.leveled,
         "about": _said(material),
+        "measured": None if measured is None else slices.carried(material, measured),
         "textures": made.about,
         "data": {name: encoded(data) for name, data in made.data.items()},
         "fragment": "#version 300 es\nprecision highp float;\nprecision highp int;\n"

@@ -23,6 +23,13 @@ def composed(body: str, script: str, *, title: str, **values: str) -> str:
     )
 
 
+def styled(body: str, *, title: str) -> str:
+    """A whole page without a script."""
+    return filled(
+        section("page.html.txt", "head") + body, title=html.escape(title), style=_text("page.css")
+    )
+
+
 def in_script(value: Any) -> str:
     """A value as JSON that may stand in a script, whatever text it holds."""
     text = json.dumps(jsonvalues.plain(value), allow_nan=False, separators=(",", ":"))

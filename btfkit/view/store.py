@@ -38,8 +38,7 @@ class Thumbnails(NamedTuple):
 def page(btf: BTF, *, title: str, progress: Callable[[int, int], None] | None = None) -> str:
     """One HTML page of a BTF; textures are shrunk and coded in 8 bits, as the page says."""
     small = thumbnails(btf, progress=progress)
-    peak = max(float(small.linear.max()), 1e-6)
-    codes = np.rint(255 * colour.to_srgb(np.clip(small.linear / peak, 0, 1))).astype(np.uint8)
+    codes, peak = coded(small)
     lights, light_of = directions.unique(btf.light[small.pairs])
     views, view_of = directions.unique(btf.view[small.pairs])
     m, h, w, _ = small.linear.shape
@@ -48,21 +47,33 @@ def page(btf: BTF, *, title: str, progress: Callable[[int, int], None] | None = 
         "lights": np.round(lights, 5), "views": np.round(views, 5),
         "pairs": np.stack([light_of, view_of], axis=1),
         "of": small.pairs if m < btf.shape[0] else None,
-        "codes": base64.b64encode(codes.tobytes()).decode(),
+        "codes": codes,
         "about": _said(btf, small, peak),
     }  # fmt: skip
     return composed("store", "store.js", title=title, store=in_script(carried))
 
 
-def thumbnails(btf: BTF, *, progress: Callable[[int, int], None] | None = None) -> Thumbnails:
-    """As many pairs, as large, as a page can carry; read one after the other.
+def coded(small: Thumbnails) -> tuple[str, float]:
+    """Textures in 8 bits, sRGB coded, as base64, and the brightest value, which is 255."""
+    peak = max(float(small.linear.max()), 1e-6)
+    codes = np.rint(255 * colour.to_srgb(np.clip(small.linear / peak, 0, 1))).astype(np.uint8)
+    return base64.b64encode(codes.tobytes()).decode(), peak
+
+
+def thumbnails(
+    btf: BTF,
+    *,
+    texels: int = MOST_TEXELS,
+    progress: Callable[[int, int], None] | None = None,
+) -> Thumbnails:
+    """As many pairs, as large, as `texels` can carry; read one after the other.
 
     Values that are not finite count as nothing in the means.
     """
     n, h, w, _ = btf.shape
-    most = max(MOST_TEXELS // (min(_LEAST_SIDE, h) * min(_LEAST_SIDE, w)), 1)
+    most = max(texels // (min(_LEAST_SIDE, h) * min(_LEAST_SIDE, w)), 1)
     pairs = np.unique(np.linspace(0, n - 1, min(n, most)).astype(np.intp))
-    shrink = max(math.sqrt(len(pairs) * h * w / MOST_TEXELS), 1.0)
+    shrink = max(math.sqrt(len(pairs) * h * w / texels), 1.0)
     size = max(int(h / shrink), 1), max(int(w / shrink), 1)
     matrix = visible(btf.channels)
     linear = np.zeros((len(pairs), *size, 3), np.float32)

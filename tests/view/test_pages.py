@@ -7,6 +7,7 @@ import html
 import json
 import re
 import warnings
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 from cases import GRID, made
 
+from btfkit import colour
 from btfkit.directions import from_angles
 from btfkit.export.glsl.atlas import quantised
 from btfkit.fitting.fit import fit
@@ -287,3 +289,62 @@ def test_a_store_opens_pair_by_pair(tmp_path: Path) -> None:
     (tmp_path / "plain.html").write_text(text)
     assert browser.screenshot(tmp_path / "plain.html", picture).errors == []
     assert cv2.imread(str(picture)).std() > 10
+
+
+def measured_knit() -> Any:
+    return synth_btf("knit", size=16, lights="9", views="7", samples=4)
+
+
+def test_a_measured_pair_is_shown_as_it_was_measured_beside_the_models_answer(
+    tmp_path: Path,
+) -> None:
+    material, btf = fitted(), measured_knit()
+    text = model.page(material, title="x", measured=btf)
+    script = f"""{ENCODE}
+      return [0, 3, 7].map((pair) => {{
+        Object.assign(view.state, {{pair, split: 0.5, shape: "torus", repeat: 4, eye: [60, 10]}});
+        view.paint();
+        const over = document.getElementById("measured"), copy = Object.assign(document.createElement("canvas"), {{width: over.width, height: over.height}});
+        const pen = copy.getContext("2d", {{willReadFrequently: true}});
+        pen.drawImage(over, 0, 0);
+        const side = Math.min(over.width, over.height), left = (over.width - side) / 2, top = (over.height - side) / 2;
+        const at = (u, v) => Array.from(pen.getImageData(left + u * side, top + v * side, 1, 1).data);
+        const shown = [[0.28125, 0.34375], [0.09375, 0.84375]].map(([u, v]) => [at(u, v), view.measuredAt(u, v)]);
+        return {{four: [1, 2, 3, 4].map((show) => coded(view.read(show, {W}, {H}))), shown, right: at(0.8, 0.5), pair: MATERIAL.measured.pairs[pair]}};
+      }});"""
+    for told in probed(text, script, tmp_path):
+        pair = told["pair"]
+        numbers = np.stack([
+            np.frombuffer(base64.b64decode(x), "<f4").reshape(H, W, 4)[::-1] for x in told["four"]
+        ])  # fmt: skip
+        inside = numbers[0, ..., 3] > 0
+        # A plane that fills the picture's height, in the pair's own light and view.
+        assert inside.sum() == H * H
+        np.testing.assert_allclose(
+            numbers[1, inside, :3], np.broadcast_to(btf.light[pair], (H * H, 3)), atol=1e-5
+        )
+        np.testing.assert_allclose(
+            numbers[2, inside, :3], np.broadcast_to(btf.view[pair], (H * H, 3)), atol=1e-5
+        )
+        wanted = material.evaluate(
+            numbers[0, inside, :2], btf.light[pair], btf.view[pair], numbers[0, inside, 2]
+        ).reflectance
+        # Half floats of textures that are not quantised here; edges of the march.
+        assert np.mean(np.abs(numbers[3, inside, :3] - wanted) > 5e-3) <= 1e-3
+        texture = btf.texture(pair)
+        for (shown, linear), (row, col) in zip(told["shown"], ((5, 4), (13, 1)), strict=True):
+            # 8 bits, sRGB coded, up to the brightest texel of all pairs.
+            np.testing.assert_allclose(linear, texture[row, col], atol=0.012)
+            code = 255 * colour.to_srgb(np.clip(texture[row, col], 0, 1))
+            # The canvas draws between texels, whose middles these are.
+            np.testing.assert_allclose(shown[:3], code, atol=9)
+            assert shown[3] == 255
+        assert told["right"][3] == 0
+
+
+def test_a_measurement_that_is_not_the_models_is_refused() -> None:
+    btf = measured_knit()
+    with pytest.raises(ValueError, match="the model answers channels R, G, B"):
+        model.page(fitted(), title="x", measured=replace(btf, channels=("a", "b", "c")))
+    with pytest.raises(ValueError, match="their tiles have other proportions"):
+        model.page(fitted(), title="x", measured=btf.crop(slice(0, 8), slice(0, 16)))

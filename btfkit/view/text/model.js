@@ -1,7 +1,8 @@
 "use strict";
 const view = (() => {
   const SHAPES = ["plane", "sphere", "cylinder", "torus"], DEGREE = Math.PI / 180;
-  const START = {shape: "sphere", repeat: 2, zoom: 1, eye: [0, 0], light: [40, 125], exposure: 0, detail: 1};
+  const START = {shape: "sphere", repeat: 2, zoom: 1, eye: [0, 0], light: [40, 125], exposure: 0, detail: 1, pair: -1, split: 0.5};
+  const MEASURED = MATERIAL.measured;
   const canvas = document.getElementById("picture"), by = (id) => document.getElementById(id);
   const state = {}, pixelShown = {};
   let gl, program, uniforms, floats, drag = "eye", asked = false, coarse = 1, frameMs = 0;
@@ -31,19 +32,23 @@ const view = (() => {
   const scaled = (a, k) => a.map((x) => x * k);
   const unit = (a) => scaled(a, 1 / Math.hypot(...a));
 
+  // A measured pair is shown straight from above, on a plane, in its own light and seen as its own view.
+  const compared = () => MEASURED !== null && state.pair >= 0;
+  const now = () => (compared() ? {...state, shape: "plane", repeat: 1, eye: [0, 0]} : state);
+
   // The eye far away, as `btfkit render` has it: y is up, a square shows the whole shape.
   function camera(w, h) {
-    const eye = way(state.eye), aspect = MATERIAL.aspect;
+    const {eye: angles_, shape} = now(), eye = way(angles_), aspect = MATERIAL.aspect;
     const up = Math.abs(eye[1]) < 1 - 1e-9 ? [0, 1, 0] : [0, 0, -eye[1]];
-    const half = {plane: 1, sphere: 1.04, torus: 1.04, cylinder: 1.04 * Math.hypot(1, Math.PI / aspect / 2)}[state.shape];
+    const half = {plane: 1, sphere: 1.04, torus: 1.04, cylinder: 1.04 * Math.hypot(1, Math.PI / aspect / 2)}[shape];
     const right = unit(cross(up, eye)), pixel = 2 * half * Math.max(1, h / w) / state.zoom / h;
     return {eye, right: scaled(right, pixel), down: scaled(cross(eye, right), -pixel)};
   }
 
   function tiles() {
-    const n = state.repeat, a = MATERIAL.aspect;
-    if (state.shape === "plane") return [2 / n, 2 / n / a];
-    if (state.shape === "torus") return [4 * n, Math.max(Math.round(4 * n * a / 2), 1)];
+    const {repeat: n, shape} = now(), a = MATERIAL.aspect;
+    if (shape === "plane") return [2 / n, 2 / n / a];
+    if (shape === "torus") return [4 * n, Math.max(Math.round(4 * n * a / 2), 1)];
     return [Math.PI / n, Math.PI / n / a];
   }
 
@@ -52,8 +57,10 @@ const view = (() => {
     gl.uniform2f(uniforms.size, w, h);
     gl.uniform2f(uniforms.corner, ...corner);
     for (const name of ["eye", "right", "down"]) gl.uniform3f(uniforms[name], ...c[name]);
-    gl.uniform3f(uniforms.lamp, ...way(state.light));
-    gl.uniform1i(uniforms.shape, SHAPES.indexOf(state.shape));
+    gl.uniform3f(uniforms.lamp, ...(compared() ? MEASURED.lights[state.pair] : way(state.light)));
+    gl.uniform3f(uniforms.seen, ...(compared() ? MEASURED.views[state.pair] : [0, 0, 0]));
+    gl.uniform1f(uniforms.least, compared() ? MEASURED.least : 0);
+    gl.uniform1i(uniforms.shape, SHAPES.indexOf(now().shape));
     gl.uniform1i(uniforms.show, show);
     gl.uniform1f(uniforms.tile, tile);
     gl.uniform1f(uniforms.tileHeight, tileHeight);
@@ -89,7 +96,41 @@ const view = (() => {
     if (canvas.width !== w || canvas.height !== h) Object.assign(canvas, {width: w, height: h});
     gl.viewport(0, 0, w, h);
     draw(0, w, h);
+    overlay();
     say();
+  }
+
+  // The measured texture of the chosen pair, exposed as the model is, left of the slider.
+  const coded = (x) => 255 * (x <= 0.0031308 ? 12.92 * x : 1.055 * Math.pow(x, 1 / 2.4) - 0.055);
+  const linear = (code) => (code <= 10 ? code / 255 / 12.92 : Math.pow((code / 255 + 0.055) / 1.055, 2.4)) * MEASURED.peak;
+  let texture = null, texture_of = "";
+  function overlay() {
+    const over = by("measured");
+    over.hidden = !compared();
+    if (over.hidden) return;
+    const {w, h} = MEASURED, key = `${state.pair} ${state.exposure}`;
+    if (texture_of !== key) {
+      texture = Object.assign(document.createElement("canvas"), {width: w, height: h});
+      const pixels = new ImageData(w, h), gain = 2 ** state.exposure, table = new Uint8ClampedArray(256);
+      for (let code = 0; code < 256; ++code) table[code] = coded(clamp(linear(code) * gain, 0, 1));
+      for (let k = 0, at = 3 * w * h * state.pair; k < w * h; ++k, at += 3)
+        pixels.data.set([table[MEASURED.bytes[at]], table[MEASURED.bytes[at + 1]], table[MEASURED.bytes[at + 2]], 255], 4 * k);
+      texture.getContext("2d").putImageData(pixels, 0, 0);
+      texture_of = key;
+    }
+    const cw = canvas.clientWidth, ch = canvas.clientHeight, ratio = Math.min(window.devicePixelRatio || 1, 2);
+    Object.assign(over, {width: cw * ratio, height: ch * ratio});
+    Object.assign(over.style, {width: `${cw}px`, height: `${ch}px`});
+    const pen = over.getContext("2d"), side = Math.min(cw, ch) * state.zoom * ratio;
+    const left = (over.width - side) / 2, top = (over.height - side) / 2, edge = left + side * state.split;
+    pen.save();
+    pen.beginPath();
+    pen.rect(left, top, side * state.split, side);
+    pen.clip();
+    for (let y = 0; y < side; y += side / MATERIAL.aspect) pen.drawImage(texture, left, top + y, side, side / MATERIAL.aspect);
+    pen.restore();
+    pen.fillStyle = "#fff";
+    pen.fillRect(edge - ratio / 2, top, ratio, side);
   }
   function request() {
     if (!asked) requestAnimationFrame(paint);
@@ -126,8 +167,14 @@ const view = (() => {
     by("exposure-said").textContent = `${state.exposure} stops`;
     by("detail").checked = state.detail > 0;
     by("detail").disabled = !MATERIAL.leveled;
+    if (MEASURED) {
+      by("pair").value = state.pair;
+      by("split").value = state.split;
+      by("split").disabled = !compared();
+      by("split-said").textContent = compared() ? `${Math.round(100 * state.split)} %` : "";
+    }
     for (const [id, chosen] of [["shapes", state.shape], ["drags", drag]])
-      for (const button of by(id).children) button.setAttribute("aria-checked", button.dataset.name === chosen);
+      for (const button of by(id).children) button.setAttribute("aria-checked", button.dataset.name === chosen && !(id === "shapes" && compared()));
   }
   const angles = (x, y, z) => `${(Math.atan2(Math.hypot(x, y), z) / DEGREE).toFixed(1)}°, ${((Math.atan2(y, x) / DEGREE + 360) % 360).toFixed(1)}°`;
 
@@ -147,8 +194,14 @@ const view = (() => {
       ["view θ, φ", angles(vx, vy, vz)],
       ["footprint", `${footprint.toFixed(2)} texels`],
       ["R G B", pixelShown.rgb.map((c) => c.toFixed(4)).join(" ")],
+      ...(compared() ? [["measured", measuredAt(u, v).map((c) => c.toFixed(4)).join(" ")]] : []),
       ...(opacity < 1 ? [["opacity", opacity.toFixed(3)]] : []),
     ]);
+  }
+
+  function measuredAt(u, v) {
+    const {w, h, bytes} = MEASURED, at = 3 * (w * h * state.pair + w * Math.min(Math.floor(v * h), h - 1) + Math.min(Math.floor(u * w), w - 1));
+    return [0, 1, 2].map((k) => linear(bytes[at + k]));
   }
 
   // Milliseconds of a frame of w x h pixels, waited for; the least of some.
@@ -221,10 +274,11 @@ const view = (() => {
         ",": () => set("exposure", clamp(state.exposure - 0.25, -4, 6)), ".": () => set("exposure", clamp(state.exposure + 0.25, -4, 6)),
         "[": () => set("repeat", clamp(state.repeat - 1, 1, 16)), "]": () => set("repeat", clamp(state.repeat + 1, 1, 16)),
         d: () => set("detail", 1 - state.detail), r: reset,
+        ...(MEASURED ? {m: () => set("pair", (state.pair + 2) % (MEASURED.lights.length + 1) - 1)} : {}),
       };
       if (e.ctrlKey || e.metaKey || e.altKey) return;
       if (arrows[e.key]) turn(e.shiftKey ? "light" : "eye", ...arrows[e.key]);
-      else if (SHAPES[Number(e.key) - 1]) set("shape", SHAPES[Number(e.key) - 1]);
+      else if (SHAPES[Number(e.key) - 1]) choose(SHAPES[Number(e.key) - 1]);
       else if (others[e.key.toLowerCase()]) others[e.key.toLowerCase()]();
       else return;
       e.preventDefault();
@@ -233,19 +287,24 @@ const view = (() => {
     by("exposure").oninput = (e) => set("exposure", Number(e.target.value));
     by("detail").onchange = (e) => set("detail", Number(e.target.checked));
     by("reset").onclick = reset;
+    by("pair").onchange = (e) => set("pair", Number(e.target.value));
+    by("split").oninput = (e) => set("split", Number(e.target.value));
     const radios = (id, names, choose) => by(id).append(...names.map(([name, shown]) => {
       const button = Object.assign(document.createElement("button"), {type: "button", textContent: shown, onclick: () => choose(name)});
       button.setAttribute("role", "radio");
       button.dataset.name = name;
       return button;
     }));
-    radios("shapes", SHAPES.map((name) => [name, name]), (name) => set("shape", name));
+    const choose = (name) => { state.pair = -1; set("shape", name); };
+    radios("shapes", SHAPES.map((name) => [name, name]), choose);
     radios("drags", [["eye", "drag the eye"], ["light", "drag the light"]], (name) => { drag = name; request(); });
     new ResizeObserver(request).observe(canvas);
     canvas.addEventListener("webglcontextlost", (e) => { e.preventDefault(); fail("The graphics driver took the page's context away. Load the page again."); });
   }
   function reset() {
     Object.assign(state, addressed());
+    state.pair = MEASURED ? clamp(Math.round(state.pair), -1, MEASURED.lights.length - 1) : -1;
+    state.split = clamp(state.split, 0, 1);
     request();
   }
 
@@ -264,10 +323,16 @@ const view = (() => {
     const data = Object.fromEntries(Object.entries(MATERIAL.data).map(([name, text]) => [name, btfkitBytes(text)]));
     btfkitBind(gl, program, btfkitTextures(gl, MATERIAL.textures, data));
     rows(by("about"), MATERIAL.about);
+    if (MEASURED) {
+      MEASURED.bytes = new Uint8Array(btfkitBytes(MEASURED.codes));
+      by("comparing").hidden = false;
+      const named = MEASURED.lights.map((light, k) => `${MEASURED.pairs[k]}: light ${angles(...light)}, view ${angles(...MEASURED.views[k])}`);
+      by("pair").append(...["none: the shape", ...named].map((text, k) => Object.assign(document.createElement("option"), {value: k - 1, textContent: text})));
+    }
     listen();
     reset();
   }
   Object.assign(state, START);
   start();
-  return {state, read, under, paint, timed, pixelShown};
+  return {state, read, under, paint, timed, pixelShown, measuredAt};
 })();
