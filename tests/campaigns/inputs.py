@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io as bytes_io
 import json
+import shutil
 import struct
 import warnings
 import zipfile
@@ -166,6 +167,7 @@ def _as_unpacked(source: Path, name: str, found: dict[int, np.ndarray]) -> None:
     except Exception:  # a member that no image of ours is: there is no judge
         return
     folder = source.with_name(source.stem + ".unpacked")
+    shutil.rmtree(folder, ignore_errors=True)
     for member, data in members.items():
         path = folder / member
         if ".." in Path(member).parts or not member or member.endswith("/"):
@@ -180,8 +182,6 @@ def _as_unpacked(source: Path, name: str, found: dict[int, np.ndarray]) -> None:
     except HARMLESS as error:
         raise Find(f"unpacked it is refused: {error}") from error
     finally:
-        import shutil
-
         shutil.rmtree(folder, ignore_errors=True)
 
 

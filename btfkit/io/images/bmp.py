@@ -37,7 +37,7 @@ def describe(name: str, data: bytes) -> Header:
     (pixels,), (length,) = struct.unpack_from("<I", data, 10), struct.unpack_from("<I", data, 14)
     if not 14 + length <= pixels < len(data):
         raise FormatError(
-            name, f"its pixels lie at byte {pixels} of {len(data)}; expected {14 + length} or later",
+            name, f"pixels at byte {pixels} of {len(data)}; expected {14 + length} or later",
             remedy="copy it again, or save it as PNG",
         )  # fmt: skip
     return Header(h, w, colours=3, bits=8, declared=_declared(name, data))
