@@ -69,9 +69,13 @@ def described(path: Path) -> dict[str, Any]:
 
     kind = sources.kind_of(path)
     if kind == "model":
-        from btfkit.materials.file import header_of
+        from btfkit.coverage import UNKNOWN
+        from btfkit.materials.file import coverage_of, header_of
 
-        return {"kind": kind, "bytes": path.stat().st_size, **header_of(path)}
+        coverage = coverage_of(path)
+        measured = UNKNOWN if coverage is None else coverage.described()
+        size = path.stat().st_size
+        return {"kind": kind, "bytes": size, "coverage": measured, **header_of(path)}
     found = sources.measured(path)
     if isinstance(found, BTF):
         return {"kind": kind, "path": path, **_of_btf(found)}

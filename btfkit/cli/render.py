@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from btfkit.cli.bar import Bar
+from btfkit.cli.guessed import of_coverage
 from btfkit.cli.options import NumbersType, force_option, out_option, seed_option, stem
 from btfkit.cli.outcome import Outcome, verb
 from btfkit.jsonvalues import plain
@@ -48,6 +49,8 @@ btfkit render wool.btf.zarr -o wool.exr --shape torus --env hall.hdr --repeat 3"
 @click.option("--exposure", type=float, default=0.0, show_default=True, help="Stops, PNG only.")
 @click.option("--background", type=NumbersType("R,G,B", float),
               help="Linear, PNG only; black, or grey without --light and --env.")  # fmt: skip
+@click.option("--show-confidence", is_flag=True,
+              help="Grey where answers were measured, orange where they are guessed.")  # fmt: skip
 @seed_option
 @force_option
 def render_verb(
@@ -65,6 +68,7 @@ def render_verb(
     spp: int | None,
     exposure: float,
     background: tuple[float, float, float] | None,
+    show_confidence: bool,
     seed: int,
     force: bool,
 ) -> Outcome:
@@ -90,7 +94,12 @@ def render_verb(
     picture.check_name(final)
     refuse_existing(final, force=force)
     material = sources.material(source, curved=shape != "plane")
-    if env is not None or shape != "plane":
+    guessed = of_coverage(material.header.coverage)
+    if show_confidence:
+        from btfkit.render.confidence import Confidence
+
+        material = Confidence(material)
+    elif env is not None or shape != "plane":
         # Such a picture needs most of the textures anyway.
         material = _at_hand(material)
     # A plane fills the picture, which by default has the shape of the material.
@@ -120,6 +129,7 @@ def render_verb(
         "shape": shape, "lights_deg": lights, "irradiance": irradiance,
         "env": env, "env_turn_deg": env_turn,
         "view_deg": view, "repeat": repeat, "spp": samples, "seed": seed,
+        "show_confidence": show_confidence,
     }  # fmt: skip
     picture.write(
         seen, final, channels=channels, exposure=exposure,
@@ -128,9 +138,10 @@ def render_verb(
     )  # fmt: skip
     seconds = time.perf_counter() - start
     return Outcome(
-        f"{final}: {w} x {h}, {samples} rays a pixel, {seen.asked} queries, {seconds:.1f} s",
+        f"{final}: {w} x {h}, {samples} rays a pixel, {seen.asked} queries, {seconds:.1f} s"
+        f"{guessed.line}",
         {"out": final, "size": (w, h), "queries": seen.asked, "seconds": seconds,
-         "cover": float(seen.cover.mean()), **about},
+         "cover": float(seen.cover.mean()), **about, **guessed.data},
         then="open it; --env FILE.hdr lights it by surroundings, --repeat tiles it",
     )  # fmt: skip
 

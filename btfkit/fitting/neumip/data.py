@@ -15,6 +15,7 @@ from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.neumip.levels import Level, coarser
 from btfkit.fitting.pool import Pool
+from btfkit.fitting.prior.pairs import Guesses
 from btfkit.native.draw import Draw, Images, draw
 from btfkit.native.neural.layout import Array
 from btfkit.queries import QuerySet
@@ -76,7 +77,10 @@ class Source(ABC):
 
 @final
 class TexelSource(Source):
-    """Texels of a BTF's training pairs, level 0 sharp, coarser levels from blurred textures."""
+    """Texels of a BTF's training pairs, level 0 sharp, coarser levels from blurred textures.
+
+    A share of each level is guessed, where there are guesses.
+    """
 
     def __init__(
         self,
@@ -94,6 +98,7 @@ class TexelSource(Source):
         self.masked = self._pool.masked
         made = coarser(self._pool.images, levels, seed=seed, wrap=btf.wrap == "wrap")
         self._coarse = [self._coarser(level) for level in made]
+        self._guesses: Guesses | None = None
         self._room: tuple[Draw, Array] | None = None
 
     def batch(self, step: int, count: int) -> Batch:
@@ -107,6 +112,10 @@ class TexelSource(Source):
             footprint[share.start : share.stop] = blur
         blurred = footprint if self._coarse else None
         return Batch(out.uv, out.light, out.view, blurred, out.target)
+
+    def guess(self, guesses: Guesses | None) -> None:
+        """Let a share of every batch be guessed from now on; None lets none."""
+        self._guesses = guesses
 
     @property
     def pairs(self) -> NDArray[np.intp]:
@@ -127,8 +136,18 @@ class TexelSource(Source):
         seed >>= 1  # room for one number a query
         for level, (images, blur) in enumerate(self._coarse):
             share = max(at // 2, 1) if level == 0 else max(at // 3, 1)
-            found.append(Share(images, blur, seed ^ (level + 1) << 40, at - share, at))
+            mixed = seed ^ (level + 1) << 40
+            if self._guesses:
+                guess, its_blur = self._guesses.coarse[level]
+                few = int(self._guesses.share * share)
+                found.append(Share(guess, its_blur, mixed ^ 1 << 48, at - few, at))
+                at, share = at - few, share - few
+            found.append(Share(images, blur, mixed, at - share, at))
             at -= share
+        if self._guesses:
+            few = int(self._guesses.share * at)
+            found.append(Share(self._guesses.sharp, None, seed ^ 1 << 48, at - few, at))
+            at -= few
         return [*found, Share(self._images(), None, seed, 0, at)]
 
     def held_out(self) -> Batch:

@@ -16,6 +16,7 @@ from btfkit.errors import FitError
 from btfkit.fitting.loop import Generators, Trainable
 from btfkit.fitting.neumip.data import Batch, RowSource, Source, TexelSource
 from btfkit.fitting.neumip.settings import Shared, refuse_unused
+from btfkit.fitting.prior.pairs import Guesses
 from btfkit.footprint import most_levels
 from btfkit.materials.base import Header
 from btfkit.materials.neumip import arrays as neumip_arrays
@@ -53,11 +54,16 @@ class Recipe(Trainable, ABC, Generic[S]):
         self.spec = self._spec(size, min(levels, most_levels(size)))
         self.layout = self.spec.layout(self._header)
         self._source: Source
+        self._guesses: Guesses | None = None
         if isinstance(source, BTF):
-            self._source = TexelSource(
-                source, train, test, levels=self._data_levels(), seed=generators.seed,
+            levels = self._data_levels()
+            textures = TexelSource(
+                source, train, test, levels=levels, seed=generators.seed,
                 pool_bytes=s.pool_mb << 20, progress=progress,
             )  # fmt: skip
+            self._guesses = self._guessed(source, train, levels)
+            textures.guess(self._guesses)
+            self._source = textures
         else:
             self._source = RowSource(
                 source, train, test, seed=generators.seed, curved=self.spec.curved
@@ -68,9 +74,19 @@ class Recipe(Trainable, ABC, Generic[S]):
         self._begin(generators.numpy)
 
     @property
+    def begun(self) -> bool:
+        """Whether textures began from a guess."""
+        return self._guesses is not None
+
+    @property
     def source(self) -> Source:
         """Where batches come from."""
         return self._source
+
+    def _guessed(self, btf: BTF, train: NDArray[np.intp], levels: int) -> Guesses | None:
+        """What is trained on where no pair is; as published, nothing."""
+        del btf, train, levels
+        return None
 
     def _data_levels(self) -> int:
         """Levels of the data's own grid that the model's pyramid reaches to."""
