@@ -71,12 +71,15 @@ def described(path: Location) -> dict[str, Any]:
 
     kind = sources.kind_of(path)
     if kind == "model" and isinstance(path, Path):
+        from btfkit.coverage import UNKNOWN
         from btfkit.materials.explained import explained
-        from btfkit.materials.file import header_of
+        from btfkit.materials.file import coverage_of, header_of
 
-        header = header_of(path)
+        header, coverage = header_of(path), coverage_of(path)
+        measured = UNKNOWN if coverage is None else coverage.described()
         made = explained(sources.material(path))
-        return {"kind": kind, "bytes": path.stat().st_size, "made_of": made, **header}
+        size = path.stat().st_size
+        return {"kind": kind, "bytes": size, "coverage": measured, "made_of": made, **header}
     found = sources.measured(path)
     if isinstance(found, BTF):
         return {"kind": kind, "path": path, **_of_btf(found)}

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from btfkit.cli.bar import Bar
+from btfkit.cli.guessed import of_coverage
 from btfkit.cli.options import force_option, out_option, seed_option, stem, the_only
 from btfkit.cli.outcome import Outcome, verb
 from btfkit.cli.preview import of_material, preview_option
@@ -56,6 +57,8 @@ def propagate_verb(
     if scale < 1:
         found["consistency_db"] = alike = consistency(guidance, source, scale=scale)
         line += f"; {alike:.1f} dB from the material at full size, shrunk"
+    guessed = of_coverage(material.header.coverage)
+    line, found = line + guessed.line, {**found, **guessed.data}
     found |= of_material(material, final) if preview else {}
     then = f"btfkit view {shlex.quote(str(final))}"
     return Outcome(line, found, then=then)

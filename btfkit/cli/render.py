@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from btfkit.cli.bar import Bar
+from btfkit.cli.guessed import Guessed, of_coverage
 from btfkit.cli.options import (
     DurationType,
     LocationType,
@@ -75,6 +76,8 @@ btfkit render wool.neumip.safetensors --sweep view -o wool.webp --shape torus"""
               help="Of a sweep.")  # fmt: skip
 @click.option("--pairs", type=click.IntRange(2, 16),
               help="A table of so many views by so many lights, texel by texel.")  # fmt: skip
+@click.option("--show-confidence", is_flag=True,
+              help="Grey where answers were measured, orange where they are guessed.")  # fmt: skip
 @seed_option
 @force_option
 def render_verb(
@@ -90,6 +93,7 @@ def render_verb(
     frames: int,
     fps: float,
     pairs: int | None,
+    show_confidence: bool,
     force: bool,
     **chosen: Any,
 ) -> Outcome:
@@ -124,6 +128,11 @@ def render_verb(
         raise ValueError(f"{final}: a sheet of --{kind} is *.png or *.jpg")
     refuse_existing(final, force=force)
     material = _material(source, shot)
+    guessed = of_coverage(material.header.coverage)
+    if show_confidence:
+        from btfkit.render.confidence import Confidence
+
+        material = Confidence(material)
     look = _Look(material.header.channels, exposure, background or shot.background)
     if sweep:
         shots = animation.shots(shot, sweep, frames, material)
@@ -135,21 +144,29 @@ def render_verb(
     elif compare:
         made = _comparison(source, material, compare, shot, look, final, bar, force)
     else:
-        return _still(source, material, shot, look, final, bar, force, start)
+        return _still(source, material, shot, look, final, bar, force, start, guessed)
     seconds = time.perf_counter() - start
     said = "".join(f", {key} {made[key]:.4g}" for key in ("psnr", "mae") if key in made)
     return Outcome(
-        f"{final}: {seconds:.1f} s{said}",
-        {"out": final, "source": source, "model": material.model, **made, "seconds": seconds},
+        f"{final}: {seconds:.1f} s{said}{guessed.line}",
+        {
+            "out": final,
+            "source": source,
+            "model": material.model,
+            **made,
+            "seconds": seconds,
+            **guessed.data,
+        },
         then="open it",
     )
 
 
 def _still(
     source: Location, material: Material, shot: Shot, look: _Look, final: Path, bar: Bar,
-    force: bool, start: float,
+    force: bool, start: float, guessed: Guessed,
 ) -> Outcome:  # fmt: skip
     from btfkit.render import picture, studio
+    from btfkit.render.confidence import Confidence
 
     seen = shot.taken(shot.scene(material), bar)
     w, h = shot.size_of(material)
@@ -161,6 +178,7 @@ def _still(
         "shape": shot.shape, "lights_deg": lights, "irradiance": irradiance,
         "panels": shot.panels, "env": shot.env, "env_turn_deg": shot.env_turn,
         "view_deg": shot.view, "repeat": shot.repeat, "spp": seen.samples, "seed": shot.seed,
+        "show_confidence": isinstance(material, Confidence),
     }  # fmt: skip
     picture.write(
         seen, final, channels=look.channels, exposure=look.exposure,
@@ -170,9 +188,10 @@ def _still(
         raise KeyboardInterrupt
     seconds = time.perf_counter() - start
     return Outcome(
-        f"{final}: {w} x {h}, {seen.samples} rays a pixel, {seen.asked} queries, {seconds:.1f} s",
+        f"{final}: {w} x {h}, {seen.samples} rays a pixel, {seen.asked} queries, {seconds:.1f} s"
+        f"{guessed.line}",
         {"out": final, "size": (w, h), "queries": seen.asked, "seconds": seconds,
-         "cover": float(seen.cover.mean()), **about},
+         "cover": float(seen.cover.mean()), **about, **guessed.data},
         then="open it; --env FILE.hdr lights it by surroundings, --repeat tiles it",
     )  # fmt: skip
 

@@ -122,7 +122,7 @@ def fit_maps(
             progress(rows.stop, h)
     lobes = Lobes(*(np.concatenate([part[0][k] for part in parts]) for k in range(7)))
     bright, counts = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
-    return _maps(lobes, bright, counts, normals, (h, w))
+    return maps_of(lobes, bright, counts, normals, (h, w))
 
 
 def _fewer(stack: Stack) -> Stack:
@@ -211,9 +211,15 @@ def _fitted(
     )
 
 
-def _maps(
+def maps_of(
     lobes: Lobes, bright: Array, counts: Array, normals: Array | None, size: tuple[int, int]
 ) -> Maps:
+    """Lobes of the texels of a tile (h, w) as maps.
+
+    Args:
+        lobes: of h w texels. bright, counts: (h w,) mean grey value, and how many there were.
+        normals: (h, w, 3) that were given; None takes the lobes' slopes.
+    """
     known = np.isfinite(lobes.deviation)
     off = np.where(known, lobes.deviation, np.inf) / np.maximum(bright, 1e-6)
     confidence = np.where(known, lobes.kept, 0) * counts / (counts + _HALF_COUNT)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from btfkit.btf import BTF
+from btfkit.coverage import Coverage
 from btfkit.errors import FitError, unknown
 from btfkit.files import refuse_existing
 from btfkit.fitting import CLOSED_FORM, MODELS, TAUGHT, TRACED, loaded
@@ -110,7 +111,9 @@ def fit(
     if teacher is not None:
         of = {"model": teacher.model, "provenance": dict(teacher.header.provenance)}
         provenance["teacher"] = of
-    header = replace(material.header, provenance=provenance, steps=run.steps)
+    header = replace(
+        material.header, provenance=provenance, steps=run.steps, coverage=_covered(data, plan)
+    )
     material = type(material)(material.spec, material.weights, header)
     if final is not None:
         # Before the evaluation: whatever happens there, the model is safe.
@@ -222,6 +225,15 @@ def _chosen(source: BTF | QuerySet, model: str) -> tuple[str, tuple[str, ...], M
 
     choice = choose(source)
     return choice.model, choice.reasons, choice.settings
+
+
+def _covered(data: BTF | QuerySet, plan: Plan) -> Coverage | None:
+    """Which directions the training saw; None where no pair is seen from above."""
+    rows = split(len(data), plan.holdout, plan.seed)[0]
+    if isinstance(data, QuerySet):
+        rows = rows[data.valid()[rows]]
+    seen = rows[data.view[rows, 2] > 0]
+    return Coverage.of(data.light[seen], data.view[seen]) if len(seen) else None
 
 
 def _provenance(

@@ -25,8 +25,9 @@ from btfkit.files import whole
 from btfkit.materials.base import Material
 from btfkit.relief.relief import Relief
 
-# Held-out looks at the model: enough for a curve, and a small share of the time.
-_LOOKS = 12
+# Held-out looks at the model: enough for a curve, and a small share of the time. Where time is
+# what is shared, they become rarer, so that they take no more than this of it.
+_LOOKS, _LOOKING = 12, 0.1
 _SAVE_EVERY_S = 60.0
 _ROLLBACKS = 3
 # A loss this many times the recent median is a divergence, not a hard batch.
@@ -230,8 +231,12 @@ class _Keeper:
             return
         self._losses.append(loss)
         if self._run.progress() >= self._next_look:
-            self._next_look += 1 / _LOOKS
+            start = time.perf_counter()
             self._look()
+            budget = self._run.budget_s
+            # By steps, equal runs look equally often.
+            costly = (time.perf_counter() - start) / budget / _LOOKING if budget else 0.0
+            self._next_look += max(1 / _LOOKS, costly)
         if self._file and time.monotonic() - self._saved_at > _SAVE_EVERY_S:
             self.save()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
 
@@ -63,7 +63,9 @@ class FitReport:
     def as_dict(self) -> dict[str, Any]:
         """The report as JSON types; errors stand at the top level under their own keys."""
         rest = {k: v for k, v in self.__dict__.items() if k not in ("material", "errors")}
-        return {"model": self.material.model, **self.errors, **rest}
+        coverage = self.material.header.coverage
+        told = {} if coverage is None else {"coverage": coverage.described()}
+        return {"model": self.material.model, **self.errors, **rest, **told}
 
     def line(self) -> str:
         """For people: one line, and one for each part that is not trained or reason of `auto`."""
@@ -74,12 +76,14 @@ class FitReport:
         )
         if self.interrupted:
             line += "; interrupted"
+        coverage = self.material.header.coverage
+        guessed = [] if coverage is None or coverage.dense else [coverage.said()]
         return "\n  ".join([line, *self._gains(), *(f"not trained: {part}"
-                            for part in self.untrained), *self.choice])  # fmt: skip
+                            for part in self.untrained), *guessed, *self.choice])  # fmt: skip
 
     def write(self, path: Path) -> None:
         """Write it as JSON, with the material's header."""
-        header = asdict(self.material.header)
+        header = self.material.header.fields()
         text = json.dumps(plain({**self.as_dict(), "header": header}), indent=1)
         with whole(path, force=True) as partial:
             partial.write_text(text)

@@ -7,7 +7,7 @@ import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self, final
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from btfkit import queries
 from btfkit.btf import BTF, QUANTITY, RGB, Wrap
+from btfkit.coverage import UNKNOWN, Coverage
 from btfkit.native.neural import plain
 from btfkit.native.prepare import Prepared, prepare, prepare_lights
 from btfkit.program import Program
@@ -42,6 +43,8 @@ class Header:
         provenance: source, settings, versions; JSON types only.
         steps: training steps that led here.
         quantity: what the answers are.
+        coverage: which lights and views were measured; None where nobody said so. Files hold it
+            as arrays.
     """
 
     grid: tuple[int, int]
@@ -52,6 +55,7 @@ class Header:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     steps: int = 0
     quantity: str = QUANTITY
+    coverage: Coverage | None = None
 
     def __post_init__(self) -> None:
         if len(self.grid) != 2 or not all(isinstance(n, int) and n > 0 for n in self.grid):
@@ -71,7 +75,14 @@ class Header:
             texel_mm=btf.texel_mm,
             licence=btf.licence,
             provenance=dict(btf.provenance),
+            coverage=Coverage.of(btf.light, btf.view) if (btf.view[:, 2] > 0).any() else None,
         )
+
+    def fields(self) -> dict[str, Any]:
+        """Everything but the coverage, as JSON types."""
+        found = asdict(replace(self, coverage=None))
+        del found["coverage"]
+        return found
 
     @property
     def aspect(self) -> float:
@@ -86,6 +97,7 @@ class Material(ABC):
 
     Attributes:
         model: the name in `MODELS`; spec_type: its frozen dataclass.
+        computed: whether every answer follows from what is known, and none was measured.
         spec: what decides the shapes.
         weights: arrays by name, as `shapes` lists them.
         header: what the answers mean and where the material comes from.
@@ -96,6 +108,7 @@ class Material(ABC):
     has_levels: ClassVar[bool] = False
     has_curvature: ClassVar[bool] = False
     full_sphere: ClassVar[bool] = False
+    computed: ClassVar[bool] = False
 
     def __init__(self, spec: Any, weights: Mapping[str, NDArray[Any]], header: Header) -> None:
         expected = self.shapes(spec, header)
@@ -230,6 +243,26 @@ class Material(ABC):
         from btfkit.materials.lobes import sampling
 
         return sampling.pdf(self, uv, light, view, footprint)
+
+    @final
+    def confidence(self, light: ArrayLike, view: ArrayLike) -> Array:
+        """How far answers for directions rest on measured pairs, anywhere on the sample.
+
+        Args:
+            light, view: (..., 3) directions away from the surface; shapes broadcast.
+
+        Returns:
+            (...) 1 where pairs were measured, towards 0 where answers are guessed; 0 for views
+            from below the horizon. Where the file does not say what was measured, NaN and a
+            warning. 1 throughout for a relief, whose answers are computed.
+        """
+        if self.computed:
+            return np.ones(np.broadcast_shapes(np.shape(light), np.shape(view))[:-1], np.float32)
+        if self.header.coverage is None:
+            warnings.warn(f"{self.model}: {UNKNOWN}", stacklevel=2)
+            shape = np.broadcast_shapes(np.shape(light), np.shape(view))[:-1]
+            return np.full(shape, np.nan, np.float32)
+        return self.header.coverage.confidence(light, view)
 
     @final
     def evaluate(

@@ -6,7 +6,7 @@ import json
 import os
 import struct
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
+from btfkit.coverage import Coverage
 from btfkit.errors import FormatError
 from btfkit.files import whole
 from btfkit.materials import MODELS, material_class, present_name
@@ -25,6 +26,8 @@ VERSION = 1
 TRAINING = "training."
 # The finest level of the sampling lobes, (h, w, 5) float16, where they were stored.
 LOBES = "lobes.table"
+# Which lights and views were measured.
+COVERAGE = "coverage."
 
 
 def save(
@@ -47,7 +50,7 @@ def save(
     Raises:
         FileExistsError: `path` exists and `force` is False.
     """
-    header = asdict(material.header)
+    header = material.header.fields()
     metadata = {
         "btfkit": str(VERSION),
         "model": material.model,
@@ -55,6 +58,9 @@ def save(
         **{name: json.dumps(value) for name, value in header.items()},
     }
     arrays = {name: np.ascontiguousarray(value) for name, value in material.weights.items()}
+    if material.header.coverage is not None:
+        for name, value in material.header.coverage.arrays().items():
+            arrays[COVERAGE + name] = value
     for name, value in (training or {}).items():
         arrays[TRAINING + name] = np.ascontiguousarray(value)
     if lobes:
@@ -89,6 +95,9 @@ _DTYPES = {
 }  # fmt: skip
 
 
+_FIELDS = tuple(name for name in Header.__dataclass_fields__ if name != "coverage")
+
+
 def load(path: str | os.PathLike[str]) -> Material:
     """The material in a file; needs no torch.
 
@@ -104,15 +113,30 @@ def load(path: str | os.PathLike[str]) -> Material:
             raise FormatError(path, f"model {model!r}; this version knows {known}")
         kind = material_class(model)
         spec = kind.spec_type(**_tuples(described))
-        fields = {name: json.loads(metadata[name]) for name in Header.__dataclass_fields__}
+        fields = {name: json.loads(metadata[name]) for name in _FIELDS}
         table = arrays.pop(LOBES, None)
-        material: Material = kind(spec, arrays, Header(**_tuples(fields)))
+        weights = {n: a for n, a in arrays.items() if not n.startswith(COVERAGE)}
+        header = replace(Header(**_tuples(fields)), coverage=_coverage(arrays))
+        material: Material = kind(spec, weights, header)
         if table is None:
             return material
-        header = material.header
         return material.with_lobes(LobeTable.of(table, grid=header.grid, wrap=header.wrap))
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(path, f"the header does not describe a material: {error}") from error
+
+
+def coverage_of(path: str | os.PathLike[str]) -> Coverage | None:
+    """Which lights and views the pairs behind a material had; None where the file has no word."""
+    arrays, _ = _read(path, want=lambda name: name.startswith(COVERAGE))
+    try:
+        return _coverage(arrays)
+    except (KeyError, ValueError) as error:
+        raise FormatError(path, f"what was measured is not readable: {error}") from error
+
+
+def _coverage(arrays: Mapping[str, NDArray[Any]]) -> Coverage | None:
+    own = {n.removeprefix(COVERAGE): a for n, a in arrays.items() if n.startswith(COVERAGE)}
+    return Coverage.of_arrays(own) if own else None
 
 
 def training_arrays(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
@@ -127,7 +151,7 @@ def header_of(path: str | os.PathLike[str]) -> dict[str, Any]:
         metadata = _checked_metadata(path, file.metadata())
         shapes = {name: file.get_slice(name).get_shape() for name in file.keys()}  # noqa: SIM118
     decoded: dict[str, Any] = {"model": metadata["model"], "shapes": shapes}
-    for name in ("spec", *Header.__dataclass_fields__):
+    for name in ("spec", *_FIELDS):
         if name in metadata:
             decoded[name] = json.loads(metadata[name])
     decoded["model"] = present_name(metadata["model"], decoded.get("spec", {}))

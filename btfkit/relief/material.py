@@ -42,6 +42,7 @@ class TracedRelief(Material):
     has_levels: ClassVar[bool] = True
     has_curvature: ClassVar[bool] = True
     full_sphere: ClassVar[bool] = True
+    computed: ClassVar[bool] = True
 
     def __init__(self, relief: Relief, spec: TracedSpec | None = None) -> None:
         header = Header(

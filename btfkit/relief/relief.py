@@ -14,6 +14,9 @@ from btfkit.btf import RGB, Wrap
 Array = NDArray[np.float32]
 # Heights of more tiles than this are a scale gone wrong, and every ray would cross them all.
 _MOST_HEIGHT = 100.0
+# In the maps' own precision, whose 0.02 is a little less than that of float64.
+# As float32 has it: numpy before 2 would compare in float64.
+_LEAST_ROUGHNESS = np.float32(0.02)
 
 
 @final
@@ -79,8 +82,7 @@ class Relief:
                 raise ValueError(f"{name} ranges {value.min():g}..{value.max():g}; expected 0..1")
         for name in ("roughness", "roughness_across"):
             value = getattr(self, name)
-            # As float32 has it: numpy before 2 would compare in float64.
-            if value is not None and (value.min() < np.float32(0.02) or value.max() > 1):
+            if value is not None and (value.min() < _LEAST_ROUGHNESS or value.max() > 1):
                 raise ValueError(
                     f"{name} ranges {value.min():g}..{value.max():g}; expected 0.02..1"
                 )

@@ -46,6 +46,7 @@ class Settings(Guidance):
         rate: peak learning rate of the encoder.
         batch: queries a step of the first part; 0: by the size of the texture.
         precision: of the saved textures, float16 or float32.
+        guessed: as `neumip` has it.
     """
 
     free: float = 0.25
@@ -54,6 +55,7 @@ class Settings(Guidance):
     rate: float = 4e-2
     batch: int = 0
     precision: str = "float16"
+    guessed: float = 0.4
 
     def __post_init__(self) -> None:
         super().__post_init__()

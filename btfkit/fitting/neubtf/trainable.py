@@ -13,6 +13,7 @@ that lacks. docs/neubtf.md says what was tried.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, ClassVar, cast, final
 
 import numpy as np
@@ -42,6 +43,7 @@ from btfkit.fitting.neumip.data import TexelSource
 from btfkit.fitting.neumip.trainable import NeuMIP
 from btfkit.fitting.schedule import pace
 from btfkit.materials.neubtf.material import NeuBTF as Evaluated
+from btfkit.materials.neumip.material import NeuMIPMaterial
 from btfkit.settings import parsed
 
 # Steps before which an encoder carries little.
@@ -58,6 +60,8 @@ _LEAST_COSINE = 0.85
 _MARGIN = 8
 # How far heights (texels) and features (deviations) are moved to see what depends on them.
 _HEIGHT_STEP, _FEATURE_STEP, _LOOKED_AT = 0.15, 0.25, 1 << 14
+# Texels a side that tell it.
+_MOST_SIDE = 256
 
 
 @final
@@ -78,7 +82,10 @@ class NeuBTF(Trainable):
     ) -> None:
         self.settings = s = parsed(Settings, self.model, settings)
         self._btf = btf = images_of(btf, self.model)
-        shared = {"levels": 1, "batch": s.batch, "precision": s.precision, "pool_mb": s.pool_mb}
+        shared = {
+            "levels": 1, "batch": s.batch, "precision": s.precision, "pool_mb": s.pool_mb,
+            "guessed": s.guessed,
+        }  # fmt: skip
         self.free = NeuMIP(
             btf, train, test, settings={name: str(value) for name, value in shared.items()},
             generators=generators, progress=progress,
@@ -104,8 +111,9 @@ class NeuBTF(Trainable):
         network = layout.decoder
         first, _ = network.layers(layout.split(weights)[1])[0]
         first[:, network.directions.index("level") - len(network.directions)] = 0
-        # What the guidance cannot say need not be there from the start.
-        layout.textures(texels)[0][0][..., :free] *= 0.1
+        if not self.free.begun:
+            # What the guidance cannot say need not be there from the start.
+            layout.textures(texels)[0][0][..., :free] *= 0.1
         self._hold()
         self._mean, self._deviation = torch.zeros(1 + free), torch.ones(1 + free)
         self._weight = torch.ones(1 + free) / (1 + free)
@@ -228,8 +236,9 @@ class NeuBTF(Trainable):
     def _felt(self) -> list[float]:
         """Mean squared change of log(1 + rgb) a unit (texel, or 1) of every channel's square."""
         batch = self.free.source.batch(self._steps, _LOOKED_AT)
-        material = self.free.material()
+        material = _part_of(self.free.material())
         weights = dict(material.weights)
+        # A part's own uv: which texel of it answers does not matter.
         asked = (batch.uv.copy(), batch.light.copy(), batch.view.copy())
 
         def logs(name: str, channel: int, step: float) -> NDArray[np.float32]:
@@ -239,7 +248,7 @@ class NeuBTF(Trainable):
             answer = type(material)(material.spec, changed, material.header).evaluate(*asked)
             return np.log1p(answer.reflectance)
 
-        heights = _HEIGHT_STEP / (material.spec.depth_scale * self._btf.shape[2])
+        heights = _HEIGHT_STEP / (material.spec.depth_scale * material.header.grid[1])
         steps = [("texture.heights", 0, heights, _HEIGHT_STEP)]
         for k, deviation in enumerate(self._deviation[1:].tolist()):
             steps.append(("texture.0.0", k, _FEATURE_STEP * deviation, _FEATURE_STEP * deviation))
@@ -312,3 +321,20 @@ class NeuBTF(Trainable):
         carried = self.carrier().carried(material, self._guidance, material.header)
         order = np.random.default_rng([self._generators.seed, 0xCA2]).permutation(self._test)
         return errors_in(carried, self._btf, order[:_CARRIED_PAIRS], window)
+
+
+def _part_of(material: NeuMIPMaterial) -> NeuMIPMaterial:
+    """At most `_MOST_SIDE` texels a side of a material of one level: its corner, as it answers."""
+    h, w = material.spec.size
+    part = min(h, _MOST_SIDE), min(w, _MOST_SIDE)
+    if part == (h, w):
+        return material
+    weights = {
+        name: array[: part[0], : part[1]] if name.startswith("texture.") else array
+        for name, array in material.weights.items()
+    }
+    # Heights count in tile widths, and the tile is narrower.
+    heights = weights["texture.heights"].astype(np.float32) * (w / part[1])
+    weights["texture.heights"] = heights.astype(weights["texture.heights"].dtype)
+    header = replace(material.header, grid=part, wrap="clamp")
+    return type(material)(replace(material.spec, size=part), weights, header)

@@ -15,6 +15,7 @@ from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.neumip.levels import Level, coarser
 from btfkit.fitting.pool import Pool
+from btfkit.fitting.prior.pairs import Guesses
 from btfkit.native.draw import Draw, Images, draw
 from btfkit.native.neural.layout import Array
 from btfkit.queries import QuerySet
@@ -48,10 +49,13 @@ class Batch:
 @final
 @dataclass(frozen=True, eq=False)
 class Share:
-    """Rows start..stop of a batch, drawn from images of `pairs` with `seed`; blur None is 0.5."""
+    """Rows start..stop of a batch, drawn with `seed` from images; blur None is 0.5.
+
+    `pairs` are what the images were measured of; None where they are guessed.
+    """
 
     images: Images
-    pairs: NDArray[np.intp]
+    pairs: NDArray[np.intp] | None
     blur: Array | None
     seed: int
     start: int
@@ -78,7 +82,10 @@ class Source(ABC):
 
 @final
 class TexelSource(Source):
-    """Texels of a BTF's training pairs, level 0 sharp, coarser levels from blurred textures."""
+    """Texels of a BTF's training pairs, level 0 sharp, coarser levels from blurred textures.
+
+    A share of each level is guessed, where there are guesses.
+    """
 
     def __init__(
         self,
@@ -96,6 +103,7 @@ class TexelSource(Source):
         self.masked = self._pool.masked
         made = coarser(self._pool.images, levels, seed=seed, wrap=btf.wrap == "wrap")
         self._coarse = [self._coarser(level) for level in made]
+        self._guesses: Guesses | None = None
         self._room: tuple[Draw, Array] | None = None
 
     def batch(self, step: int, count: int) -> Batch:
@@ -105,12 +113,17 @@ class TexelSource(Source):
         for share in self.shares(step, count):
             part = out.part(share.start, share.stop)
             draw(share.images, share.seed, part)
-            if (factors := self._pool.factors(share.pairs)) is not None:
+            factors = None if share.pairs is None else self._pool.factors(share.pairs)
+            if factors is not None:
                 part.target[...] *= factors[part.slots]
             blur = 0.5 if share.blur is None else share.blur[part.slots]
             footprint[share.start : share.stop] = blur
         blurred = footprint if self._coarse else None
         return Batch(out.uv, out.light, out.view, blurred, out.target)
+
+    def guess(self, guesses: Guesses | None) -> None:
+        """Let a share of every batch be guessed from now on; None lets none."""
+        self._guesses = guesses
 
     @property
     def pairs(self) -> NDArray[np.intp]:
@@ -131,8 +144,18 @@ class TexelSource(Source):
         seed >>= 1  # room for one number a query
         for level, (images, blur, pairs) in enumerate(self._coarse):
             share = max(at // 2, 1) if level == 0 else max(at // 3, 1)
-            found.append(Share(images, pairs, blur, seed ^ (level + 1) << 40, at - share, at))
+            mixed = seed ^ (level + 1) << 40
+            if self._guesses:
+                guess, its_blur = self._guesses.coarse[level]
+                few = int(self._guesses.share * share)
+                found.append(Share(guess, None, its_blur, mixed ^ 1 << 48, at - few, at))
+                at, share = at - few, share - few
+            found.append(Share(images, pairs, blur, mixed, at - share, at))
             at -= share
+        if self._guesses:
+            few = int(self._guesses.share * at)
+            found.append(Share(self._guesses.sharp, None, None, seed ^ 1 << 48, at - few, at))
+            at -= few
         return [*found, Share(self._images(), self._pool.pairs, None, seed, 0, at)]
 
     def held_out(self) -> Batch:

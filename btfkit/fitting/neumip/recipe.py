@@ -16,6 +16,7 @@ from btfkit.errors import FitError
 from btfkit.fitting.loop import Generators, Trainable
 from btfkit.fitting.neumip.data import Batch, RowSource, Source, TexelSource
 from btfkit.fitting.neumip.settings import Shared, refuse_unused
+from btfkit.fitting.prior.pairs import Guesses
 from btfkit.footprint import most_levels
 from btfkit.materials.base import Header
 from btfkit.materials.neumip import arrays as neumip_arrays
@@ -52,6 +53,7 @@ class Recipe(Trainable, ABC, Generic[S]):
         levels = s.levels or self._levels(source, size)
         self.spec = self._spec(size, min(levels, most_levels(size)))
         self.layout = self.spec.layout(self._header)
+        self._guesses: Guesses | None = None
         self._source = self._batches(source, train, test, progress)
         self.masked = self._source.masked
         self._held = self._source.held_out()
@@ -76,16 +78,30 @@ class Recipe(Trainable, ABC, Generic[S]):
         """What is drawn from, once the model's shapes are known."""
         seed = self._generators.seed
         if isinstance(source, BTF):
-            return TexelSource(
-                source, train, test, levels=self._data_levels(), seed=seed,
+            levels = self._data_levels()
+            textures = TexelSource(
+                source, train, test, levels=levels, seed=seed,
                 pool_bytes=self.settings.pool_mb << 20, progress=progress,
             )  # fmt: skip
+            self._guesses = self._guessed(source, train, levels)
+            textures.guess(self._guesses)
+            return textures
         return RowSource(source, train, test, seed=seed, curved=self.spec.curved)
+
+    @property
+    def begun(self) -> bool:
+        """Whether textures began from a guess."""
+        return self._guesses is not None
 
     @property
     def source(self) -> Source:
         """Where batches come from."""
         return self._source
+
+    def _guessed(self, btf: BTF, train: NDArray[np.intp], levels: int) -> Guesses | None:
+        """What is trained on where no pair is; as published, nothing."""
+        del btf, train, levels
+        return None
 
     def _data_levels(self) -> int:
         """Levels of the data's own grid that the model's pyramid reaches to."""

@@ -87,6 +87,8 @@ class Stepped(Shared):
         smooth: texels by which textures are blurred every 16 steps while training begins; it
             halves five times in a run.
         networks: what the fitted model is evaluated in: float32 or bfloat16.
+        guessed: share of a batch that is guessed, where next to no direction is covered by
+            pairs; less in proportion where more are; 0 leaves guesses out.
     """
 
     features: int = 8
@@ -104,6 +106,7 @@ class Stepped(Shared):
     omega: float = 1.0
     smooth: float = 1.0
     networks: str = "float32"
+    guessed: float = 0.4
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -115,7 +118,7 @@ class Stepped(Shared):
         for name, low, high in (
             ("features", 1, 8), ("frames", 0, 2), ("coarse", 0, 8), ("width", 1, 128),
             ("rate", 0, 1), ("texture_rate", 0, 1), ("beta2", 0, 0.999999), ("decay", 0, 100),
-            ("omega", 0, 1000), ("smooth", 0, 8),
+            ("omega", 0, 1000), ("smooth", 0, 8), ("guessed", 0, 0.9),
         ):  # fmt: skip
             _within(self, name, low, high)
 
@@ -125,6 +128,8 @@ class Stepped(Shared):
 
     def unused(self, given: Mapping[str, str], *, pictures: bool) -> dict[str, str]:
         reasons: dict[str, str] = {}
+        if not pictures:
+            reasons["guessed"] = "only textures have a relief that could be guessed"
         if not self.sines():
             reasons["omega"] = "no layer ends in sines"
         if self.frames > self.features // 3:

@@ -6,8 +6,12 @@ import math
 
 import numpy as np
 
+from btfkit.fitting.prior.guess import Guess, averaged, enlarged
 from btfkit.materials.neumip.arrays import aligned
 from btfkit.native.neural.layout import Array, Layout, Network
+
+# How large guessed features are beside those at random.
+_NORMALS, _COLOURS = 0.5, 0.3
 
 
 def initial_weights(network: Network, flat: Array, rng: np.random.Generator, omega: float) -> None:
@@ -35,3 +39,27 @@ def initial_texels(layout: Layout, rng: np.random.Generator) -> Array:
             shape = (*texture.shape[:2], pyramid.channels)
             texture[..., : pyramid.channels] = 0.1 * rng.standard_normal(shape)
     return texels
+
+
+def begin_from(guess: Guess, layout: Layout, texels: Array) -> None:
+    """Put what is guessed where training looks for it: heights, normals in the first frame,
+    colours in the next channels. A short fit to few pairs then has only to learn the decoder.
+    """
+    if layout.heights:
+        surface = layout.surface(texels)
+        surface[...] = enlarged(guess.height, surface.shape) / np.float32(layout.depth_scale)
+    bank = int(layout.offset is not None)
+    pyramid, levels = layout.pyramids[bank], layout.textures(texels)[bank]
+    if pyramid.channels < 3 or not layout.frames:
+        return
+    colours = np.log1p(guess.albedo)
+    spread = np.maximum(colours.std(axis=(0, 1)), 1e-3)
+    colours = _COLOURS * (colours - colours.mean(axis=(0, 1))) / spread
+    count = min(colours.shape[2], pyramid.channels - 3)
+    for texture in levels:
+        size = texture.shape[:2]
+        normal = guess.normal
+        if size[0] < normal.shape[0] or size[1] < normal.shape[1]:
+            normal = averaged(normal, size)
+        texture[..., :3] = _NORMALS * enlarged(normal, size)
+        texture[..., 3 : 3 + count] = averaged(colours[..., :count], size)

@@ -11,15 +11,18 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, TypeVar, final
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
+from btfkit.btf import BTF
 from btfkit.fitting.loop import Trainable
 from btfkit.fitting.neumip.data import Batch
 from btfkit.fitting.neumip.engines.base import MOMENTS, PARAMETERS, Engine, Step
 from btfkit.fitting.neumip.engines.compiled import Compiled, Plain
 from btfkit.fitting.neumip.recipe import Recipe
 from btfkit.fitting.neumip.settings import INPUTS, Settings, Stepped
-from btfkit.fitting.neumip.start import initial_texels, initial_weights
+from btfkit.fitting.neumip.start import begin_from, initial_texels, initial_weights
+from btfkit.fitting.prior.pairs import Guesses, guesses
 from btfkit.fitting.schedule import pace
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.arrays import aligned
@@ -31,6 +34,8 @@ _SMOOTH_STEPS = 16
 _SMOOTH_HALVES = 5
 # Direction pairs for which a decay of 1 is right; docs/neumip.md has the measurements.
 _DECAY_PAIRS = 60
+# Halvings of the first batches where textures begin from a guess, and where they end.
+_SMALLER, _SMALLEST = 4, 2**12
 
 
 S = TypeVar("S", bound=Stepped)
@@ -38,6 +43,10 @@ S = TypeVar("S", bound=Stepped)
 
 class Marching(Recipe[S]):
     """What an engine takes the steps of: `neumip`, and `sbtf` on curved surfaces."""
+
+    def _guessed(self, btf: BTF, train: NDArray[np.intp], levels: int) -> Guesses | None:
+        share, seed = self.settings.guessed, self._generators.seed
+        return guesses(btf, train, levels=levels, share=share, seed=seed)
 
     def _begin(self, rng: np.random.Generator) -> None:
         layout = self.layout
@@ -47,6 +56,8 @@ class Marching(Recipe[S]):
         initial_weights(layout.decoder, decoder, rng, self.settings.omega)
         flat = np.concatenate([offset, decoder])
         arrays = {"weights": flat, "texels": initial_texels(layout, rng)}
+        if self._guesses:
+            begin_from(self._guesses.guess, layout, arrays["texels"])
         for name in PARAMETERS:
             for moment in MOMENTS:
                 room = aligned(layout.texels) if name == "texels" else np.zeros_like(flat)
@@ -96,6 +107,10 @@ class Marching(Recipe[S]):
         h, w = self.spec.size
         # 2^13 at 128 x 128, 2^16 at 512 x 512; larger towards the end, where noise costs most.
         size = 2**13 * (h * w / 2**14) ** 0.75
+        if self._guesses:
+            # Textures begin near where they end, and the decoder learns by steps, not by queries.
+            smaller = size * 2.0 ** -max(_SMALLER * (1 - 2 * progress), 0)
+            size = max(smaller, min(size, _SMALLEST))
         return int(np.clip(2 ** round(math.log2(size)), 2**10, 2**17)) << int(progress > 0.7)
 
 

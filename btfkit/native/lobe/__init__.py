@@ -24,7 +24,7 @@ _GRAZING, _LEAST_ROUGHNESS, _MOST_ALBEDO, _MOST_SLOPE = 1e-4, 0.02, 4.0, 20.0
 _ROUNDS = 14
 # How sharply slopes, roughness, albedo and gloss are held to the start, 1 / deviation^2: next to
 # nothing beside data that tell them.
-_PRIOR_SLOPE, _PRIOR_ROUGHNESS, _PRIOR_ALBEDO, _PRIOR_GLOSS = 0.05, 10.0, 1e-3, 30.0
+HELD = (0.05, 10.0, 1e-3, 30.0)
 
 
 class Lobes(NamedTuple):
@@ -70,6 +70,7 @@ def fit_lobes(
     place: Array | None = None,
     near: tuple[bool, bool] = (False, False),
     rounds: int = _ROUNDS,
+    held: tuple[float, float, float, float] = HELD,
 ) -> Lobes:
     """Fit every texel on its own.
 
@@ -82,14 +83,13 @@ def fit_lobes(
         place: (t, 3) of the texels in the unit of the positions.
         near: whether `light` and `view` are positions.
         rounds: steps tried at most.
+        held: how sharply slopes, roughness, albedo and gloss are held to the start, 1/deviation^2.
     """
     t, _, c = values.shape
     theta = _packed(start)
     is_free = np.array([slopes, slopes, rough, *([True, gloss] * c)], np.uint8)
-    prior = np.array(
-        [_PRIOR_SLOPE, _PRIOR_SLOPE, _PRIOR_ROUGHNESS, *([_PRIOR_ALBEDO, _PRIOR_GLOSS] * c)],
-        np.float32,
-    )
+    by_slope, by_roughness, by_albedo, by_gloss = held
+    prior = np.array([by_slope, by_slope, by_roughness, *([by_albedo, by_gloss] * c)], np.float32)
     places = np.zeros((t, 3), np.float32) if place is None else place
     parts = tuple(
         np.ascontiguousarray(a, np.float32) for a in (values, weight, light, view, places)
