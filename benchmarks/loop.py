@@ -20,7 +20,7 @@ from btfkit.bench.loop import Looped, compare
 
 PLAN = (
     '{"views": 4, "lights": 3, "reference_every": 30, "whites": 3, "colours": 1, "targets": 16, '
-    '"spheres": 8}'
+    '"spheres": 12}'
 )
 HANDFUL = ("mosaic", "defocus", "shot-noise")
 BTFKIT = Path(sys.executable).with_name("btfkit")

@@ -14,7 +14,7 @@ Run = Callable[..., None]
 # A dozen pairs; everything that the calibration wants to see.
 PLAN = {
     "version": 1, "name": "a dozen", "views": 4, "lights": 3, "reference_every": 30, "whites": 3,
-    "colours": 1, "targets": 12, "spheres": 6,
+    "colours": 1, "targets": 12, "spheres": 12,
 }  # fmt: skip
 # Two texels of the sample: 2.8 pixels of the mosaic, seen from above.
 TEXEL_MM = 0.5625

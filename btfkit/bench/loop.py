@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit import io
-from btfkit.calibration.captured import CapturedTextures
+from btfkit.calibration.captured_textures import CapturedTextures
 from btfkit.devices.twin.truth import blurred, truth
 
 Floats = NDArray[np.float64]

@@ -23,7 +23,10 @@ Floats = NDArray[np.float64]
 _FEWEST = 6
 # Half width of the part of the pattern that a corner is fitted to, in squares and in pixels.
 _REACH_SQUARES, _REACH_PX = 0.6, 11
-_SUBPIXELS = 3
+_SUBPIXELS = 2
+# Windows that the drawing leaves this much more of than of most show something else too.
+_COVERED = 3.0
+_SETTLED_PX = 2e-3
 # Corners that are enough to tell how sharp the lens is.
 _BLUR_CORNERS = 24
 
@@ -93,6 +96,26 @@ class Board:
         drawn = self._bits[markers, np.clip(i, 0, bits - 1), np.clip(j, 0, bits - 1)]
         return np.where(inside, drawn, self._white[row, column])
 
+    def whiteness(self, x: Floats, y: Floats, across: Floats, along: Floats) -> Floats:
+        """(...) share of white in upright rectangles of the print, exactly; 0 beyond its rim.
+
+        Args:
+            x, y: centres, mm, board frame. across, along: sides, mm; broadcast to them.
+        """
+        columns, rows, total = self._area
+        sides = []
+        for at, half, lines in ((x, across / 2, columns), (y, along / 2, rows)):
+            number = np.arange(len(lines), dtype=float)
+            sides.append([np.interp(at + sign * half, lines, number) for sign in (-1, 1)])
+        (left, right), (low, high) = sides
+
+        def below(row: Floats, column: Floats) -> Floats:
+            # Between the lines of the print its integral is bilinear.
+            return np.asarray(ndimage.map_coordinates(total, [row, column], order=1))
+
+        white = below(high, right) - below(high, left) - below(low, right) + below(low, left)
+        return np.asarray(white / (across * along))
+
     def detect(self, image: Floats) -> tuple[NDArray[np.intp], Floats]:
         """Corners in a frame, to some tenths of a pixel where the lens bends straight lines.
 
@@ -126,7 +149,7 @@ class Board:
         pose: Rigid,
         *,
         blur_px: float,
-    ) -> Floats:
+    ) -> tuple[Floats, Floats]:
         """Corners fitted with the board's own picture as the camera would see it.
 
         A homography knows neither the lens nor the markers beside a corner; the picture of the
@@ -139,7 +162,8 @@ class Board:
             blur_px: standard deviation of the lens's blur.
 
         Returns:
-            (k, 2) pixels; NaN where the frame does not show the corner.
+            (k, 2) pixels, NaN where the frame does not show the corner or something else lies
+            on it; and (k, 2) their standard deviations, of what the drawing leaves of the frame.
         """
         start = camera.project(pose(self.corners_mm[numbers]))
         window = _Window.around(image, start, self._reach_px(camera, pose, numbers))
@@ -148,11 +172,19 @@ class Board:
             drawn = self._drawn(window, shift, camera, pose, blur_px)
             step = window.fit(drawn)
             shift += step
-            if not np.nanmax(np.abs(step), initial=0.0) > 1e-4:
+            # What is left then is the square of it.
+            if not np.nanmedian(np.abs(step)) > _SETTLED_PX:
                 break
+        left = window.misfit(drawn)
         with np.errstate(invalid="ignore"):
-            shift[~(np.abs(shift).max(axis=1) < 2.5)] = np.nan
-        return start + shift
+            seen = np.abs(shift).max(axis=1) < 2.5
+            # What something else lies upon is fitted worse than most.
+            seen &= left < _COVERED * np.median(left[seen])
+        sd = window.deviation(drawn)
+        worst = sd.max(axis=1)
+        seen &= worst < _COVERED * np.median(worst[seen])
+        shift[~seen] = np.nan
+        return start + shift, sd
 
     def blur(self, image: Floats, numbers: NDArray[np.intp], camera: Camera, pose: Rigid) -> float:
         """Standard deviation of the lens's blur, px, beside the pixel's own square.
@@ -169,7 +201,8 @@ class Board:
         def misfit(blur_px: float) -> float:
             shift = window.fit(self._drawn(window, np.zeros_like(corners), camera, pose, blur_px))
             shift = np.nan_to_num(shift)
-            return window.misfit(self._drawn(window, shift, camera, pose, blur_px))
+            drawn = self._drawn(window, shift, camera, pose, blur_px)
+            return float(np.median(window.misfit(drawn)))
 
         best = optimize.minimize_scalar(misfit, bounds=(0.05, 3.0), options={"xatol": 0.01})
         return float(best.x)
@@ -200,7 +233,11 @@ class Board:
         on_board = ((rays * depth[..., None] - origin) @ pose.rotation)[..., :2]
         basis = _parabola(nodes, fine)
         place = np.einsum("ya,kabd,xb->kyxd", basis, np.nan_to_num(on_board), basis, optimize=True)
-        drawn = self.pattern(place[..., 0], place[..., 1])
+        # What a sample covers of the print: as far to the sides as its own square.
+        steps = [np.diff(place, axis=axis).reshape(len(place), -1, 2) for axis in (1, 2)]
+        sides = np.sqrt(sum((step**2).mean(axis=1) for step in steps))[:, None, None]
+        sides = np.maximum(sides, 1e-9)
+        drawn = self.whiteness(place[..., 0], place[..., 1], sides[..., 0], sides[..., 1])
         if blur_px > 0:
             drawn = ndimage.gaussian_filter(
                 drawn, (0, blur_px * _SUBPIXELS, blur_px * _SUBPIXELS), mode="nearest"
@@ -209,6 +246,20 @@ class Board:
         return drawn.reshape(k, side, _SUBPIXELS, side, _SUBPIXELS).mean((2, 4))[
             :, pad - 1 : 1 - pad, pad - 1 : 1 - pad
         ]
+
+    @cached_property
+    def _area(self) -> tuple[Floats, Floats, Floats]:
+        """Lines of the print across and up, mm, and the white up to each of them (v, u), mm^2."""
+        bits, share = self._bits.shape[-1], self.marker_mm / self.square_mm
+        inside = (1 - share) / 2 + share * np.arange(bits + 1) / bits
+        lines = []
+        for count in self.squares:
+            whole = np.append((np.arange(count)[:, None] + [0.0, *inside]).reshape(-1), count)
+            lines.append((whole - count / 2) * self.square_mm)
+        columns, rows = lines
+        middles = [(edges[1:] + edges[:-1]) / 2 for edges in lines]
+        white = self.pattern(*np.meshgrid(*middles)) * np.outer(np.diff(rows), np.diff(columns))
+        return columns, rows, np.pad(white.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
 
     def _from_print(self, points: Floats) -> Floats:
         """OpenCV counts from the upper left corner, y down."""
@@ -308,14 +359,27 @@ class _Window:
                 shift[k] = -solved[4:] / solved[1]
         return np.clip(shift, -1, 1)
 
-    def misfit(self, drawn: Floats) -> float:
-        """Share of the windows' squares that the drawing leaves, the median over windows."""
+    def deviation(self, drawn: Floats) -> Floats:
+        """(k, 2) standard deviations of `fit`'s shifts; infinite where nothing is told."""
         normal, right, square = self._equations(drawn)
-        left = []
+        count = np.isfinite(self.values).reshape(len(drawn), -1).sum(1)
+        out = np.full((len(drawn), 2), np.inf)
+        for k in range(len(drawn)):
+            solved, _, rank, _ = np.linalg.lstsq(normal[k], right[k], rcond=1e-12)
+            if rank == 6 and count[k] > 6:
+                noise = max(square[k] - right[k] @ solved, 0.0) / (count[k] - 6)
+                spread = np.linalg.inv(normal[k])[[4, 5], [4, 5]]
+                out[k] = np.sqrt(noise * spread) / max(abs(solved[1]), 1e-300)
+        return out
+
+    def misfit(self, drawn: Floats) -> Floats:
+        """(k,) share of the windows' squares that the drawings leave."""
+        normal, right, square = self._equations(drawn)
+        left = np.empty(len(drawn))
         for k in range(len(drawn)):
             solved = np.linalg.lstsq(normal[k, :4, :4], right[k, :4], rcond=1e-12)[0]
-            left.append((square[k] - right[k, :4] @ solved) / max(square[k], 1e-300))
-        return float(np.median(left))
+            left[k] = (square[k] - right[k, :4] @ solved) / max(square[k], 1e-300)
+        return left
 
     def _equations(self, drawn: Floats) -> tuple[Floats, Floats, Floats]:
         """Normal equations (k, 6, 6), right sides (k, 6) and squares (k,) of the windows."""

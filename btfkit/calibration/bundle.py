@@ -6,7 +6,7 @@ some thirty numbers. What the frames cannot tell is named and held where it was.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -22,13 +22,15 @@ from btfkit.errors import CalibrationError
 Floats = NDArray[np.float64]
 __all__ = ["Adjustment", "Sighting", "SphereSighting", "adjust"]
 
-# Of a direction in parameter space the frames must tell more than is assumed of it beforehand.
-_OBSERVED = 1.0
+# Of a direction in parameter space the frames must tell more than is assumed of it beforehand;
+# of a slip, what is assumed is told.
+_OBSERVED = 1.0 + 1e-6
 _REJECT = 5.0
 _HUBER = 3.0
 # Frames whose board lies this far from where their readings put it contradict them, px.
 _CONTRADICTION_PX = 3.0
 _ROUNDS = 5
+_REWEIGHED = 2
 
 
 @final
@@ -42,7 +44,8 @@ class Adjustment:
         condition: of the scaled Jacobian of the free parameters.
         held: parameters that the frames do not tell, held at their start.
         rms: residual of each kind of observation: corner, outline, highlight, px.
-        view_rms: (v,) of the points in each sighting, px. rejected: observations left out.
+        view_rms: (v,) of the points that count in each sighting, px.
+        rejected: observations left out.
         slips: (v, a) correction of each reading, radians or mm; 0 where none was allowed.
     """
 
@@ -62,12 +65,15 @@ class Adjustment:
         return float(np.sqrt(self.covariance[at, at]))
 
     def to_json(self) -> dict[str, Any]:
+        # Slips are of this run's frames, not of the rig.
+        rig = [i for i, name in enumerate(self.names) if not name.startswith("slip.")]
+        names = [self.names[i] for i in rig]
         return {
             **self.geometry.to_json(),
-            "sd": {name: self.sd(name) for name in self.names},
-            "covariance": {"names": list(self.names), "matrix": self.covariance.tolist()},
+            "sd": {name: self.sd(name) for name in names},
+            "covariance": {"names": names, "matrix": self.covariance[np.ix_(rig, rig)].tolist()},
             "condition": self.condition,
-            "held": list(self.held),
+            "held": [name for name in self.held if not name.startswith("slip.")],
             "residuals_px": self.rms,
             "view_rms_px": self.view_rms.tolist(),
             "rejected": self.rejected,
@@ -79,7 +85,7 @@ def adjust(
     sightings: Sequence[Sighting],
     spheres: Sequence[SphereSighting] = (),
     *,
-    slip_sd: float = 0.0,
+    slip_sd: Mapping[str, float] | None = None,
 ) -> Adjustment:
     """The geometry that fits all observations best.
 
@@ -87,7 +93,8 @@ def adjust(
         start: nominal geometry; good to some degrees and per cent.
         sightings: known points of the board (or of the sample) in frames.
         spheres: outlines and highlights of mirror spheres in frames.
-        slip_sd: how far an axis may stand from its reading, radians or mm; 0 trusts readings.
+        slip_sd: how far axes stand from their readings, by name, radians or mm; others are
+            trusted.
 
     Raises:
         CalibrationError: too few frames, or frames that contradict their readings.
@@ -97,7 +104,7 @@ def adjust(
             f"{len(sightings)} frames show known points; at least 3 are needed",
             remedy="take more target frames",
         )
-    problem = Problem(start, sightings, spheres, slip_sd=slip_sd)
+    problem = Problem(start, sightings, spheres, slip_sd=slip_sd or {})
     x = np.zeros(problem.size)
     use = np.ones(problem.count, bool)
     free = _observed(problem, x, use, np.ones(problem.size, bool))
@@ -107,6 +114,8 @@ def adjust(
         if turn == 0:
             _refuse_contradiction(problem, residual)
         keep = _inliers(problem, residual)
+        if turn < _REWEIGHED:
+            problem.reweigh(residual, keep)
         still = _observed(problem, x, keep, free)
         settled = (keep == use).all() and (still == free).all() and turn > 0
         use, free = keep, still
@@ -182,10 +191,12 @@ def _inliers(problem: Problem, residual: Floats) -> NDArray[np.bool_]:
         rows = problem.rows(kind)
         if len(rows) == 0:
             continue
-        size = np.abs(residual[rows]).reshape(-1, problem.width(kind)).max(axis=1)
+        width = problem.width(kind)
+        size = np.abs(residual[rows]).reshape(-1, width).max(axis=1)
+        sd = problem.sd_px(kind).reshape(-1, width).max(axis=1)
         # Never so tight as to reject what a hundredth of a pixel explains.
-        spread = max(1.4826 * float(np.median(size)), 0.01 / problem.sd_px(kind))
-        keep[rows] = np.repeat(size < _REJECT * spread, problem.width(kind))
+        spread = np.maximum(1.4826 * float(np.median(size)), 0.01 / sd)
+        keep[rows] = np.repeat(size < _REJECT * spread, width)
     return keep
 
 
@@ -209,26 +220,33 @@ def _outcome(
     rows, columns = np.flatnonzero(use), np.flatnonzero(free)
     scale = problem.scale[columns]
     scaled = jacobian[rows][:, columns].multiply(scale).toarray()
-    _, values, across = np.linalg.svd(scaled, full_matrices=False)
+    values = np.linalg.svd(scaled, compute_uv=False)
+    condition = float(values[0] / values[-1])
     freedom = max(len(rows) - len(columns), 1)
-    chi2 = float((residual[rows] ** 2).sum()) / freedom
-    spread = (across.T / values) * scale[:, None]
+    # Each kind of observation is as good as its residuals say, not as was expected of it.
+    noise = np.ones(problem.count)
     rms = {}
     for kind in ("corner", "outline", "highlight"):
         of_kind = problem.rows(kind)
         of_kind = of_kind[use[of_kind]]
         if len(of_kind):
-            square = (residual[of_kind] ** 2).mean() * problem.width(kind)
-            rms[kind] = float(np.sqrt(square)) * problem.sd_px(kind)
+            missed = residual[of_kind] * problem.sd_px(kind)[use[problem.rows(kind)]]
+            rms[kind] = float(np.sqrt((missed**2).mean() * problem.width(kind)))
+            noise[of_kind] = np.sqrt((residual[of_kind] ** 2).mean() * len(rows) / freedom)
+    _, values, across = np.linalg.svd(scaled / noise[rows][:, None], full_matrices=False)
+    spread = (across.T / values) * scale[:, None]
     told = free.copy()
     return Adjustment(
         geometry=problem.geometry(x),
         names=tuple(problem.names[i] for i in columns),
-        covariance=chi2 * spread @ spread.T,
-        condition=float(values[0] / values[-1]),
+        covariance=spread @ spread.T,
+        condition=condition,
         held=tuple(problem.names[i] for i in np.flatnonzero(~told)),
         rms=rms,
-        view_rms=problem.by_sighting(residual, lambda e: float(np.sqrt((e**2).mean()))),
+        view_rms=problem.by_sighting(
+            np.where(use, residual, np.nan),
+            lambda e: np.sqrt(np.nanmean(e**2)) if np.isfinite(e).any() else np.inf,
+        ),
         rejected=int((~use).sum()),
         slips=problem.slips(x),
     )

@@ -26,11 +26,17 @@ from btfkit.calibration.mirrors import highlight, highlight_derivatives, outline
 Floats = NDArray[np.float64]
 Index = NDArray[np.intp]
 # Expected noise of an observation, px: relative weights of the kinds.
-_SD_PX = {"corner": 0.02, "outline": 0.15, "highlight": 0.1}
+_SD_PX = {"corner": 0.02, "outline": 0.15, "highlight": 0.02}
+# How far the noise of a kind may be from what was expected.
+_NOISE = (0.1, 5.0)
+# Of a corner that was fitted to a frame, however little the fit leaves.
+_LEAST_PX = 0.002
 # What is assumed beforehand of each kind of parameter: the scale of the solver, and what the
 # frames must tell better to be asked at all.
 _SCALE_PX = {"fx": 0.05, "fy": 0.05, "cx": 0.05, "cy": 0.05}
-_SCALE_LENS = {"k1": 0.1, "k2": 0.2, "p1": 0.01, "p2": 0.01, "k3": 0.2}
+# Of distortions, by what they do in the corner of the frame, as shares of the way to it.
+_SCALE_LENS = {"k1": 0.02, "k2": 0.02, "p1": 0.005, "p2": 0.005, "k3": 1e-3}
+_POWER_LENS = {"k1": 2, "k2": 4, "p1": 1, "p2": 1, "k3": 6}
 _SCALE_TURN, _SCALE_MM, _SCALE_LIGHT_MM = 0.05, 5.0, 50.0
 _LENS_GIVES_UP, _BOARD_GIVES_UP = 10.0, 100.0
 
@@ -44,6 +50,7 @@ class Sighting:
         name: of the frame, for messages.
         readings: of the axes, radians or mm.
         points_mm: (m, 3) in the frame that `on` names. pixels: (m, 2).
+        sd_px: (m, 2) their standard deviations; None where nothing tells.
     """
 
     name: str
@@ -51,6 +58,7 @@ class Sighting:
     points_mm: Floats
     pixels: Floats
     on: Literal["board", "sample"] = "board"
+    sd_px: Floats | None = None
 
 
 @final
@@ -96,13 +104,13 @@ class Problem:
         sightings: Sequence[Sighting],
         spheres: Sequence[SphereSighting],
         *,
-        slip_sd: float,
+        slip_sd: Mapping[str, float],
     ) -> None:
         self.start = start
-        self.slip_sd = slip_sd
         self._sightings, self._spheres = tuple(sightings), tuple(spheres)
         self.names_of_sightings = [sighting.name for sighting in sightings]
         self.axis_names = [axis.name for axis in start.kinematics.axes]
+        self._slip_sd = np.array([slip_sd.get(name, 0.0) for name in self.axis_names])
         every: list[Sighting | SphereSighting] = [*sightings, *spheres]
         self._frames = [entry.name for entry in every]
         self._readings = np.array([self._row(entry.readings) for entry in every])
@@ -122,22 +130,35 @@ class Problem:
         """Residuals that one observation has."""
         return 1 if kind == "outline" else 2
 
-    @staticmethod
-    def sd_px(kind: str) -> float:
-        return _SD_PX[kind]
+    def sd_px(self, kind: str) -> Floats:
+        """Expected standard deviation of each residual of a kind, px."""
+        expected = (
+            self._corner_sd.reshape(-1)
+            if kind == "corner"
+            else np.full(len(self._rows[kind]), _SD_PX[kind])
+        )
+        return self._noise[kind] * expected
+
+    def reweigh(self, residual: Floats, use: NDArray[np.bool_]) -> None:
+        """Expect of each kind of observation what its residuals are, within a factor of some."""
+        for kind, rows in self._rows.items():
+            mine = residual[rows[use[rows]]]
+            if len(mine):
+                noise = self._noise[kind] * float(np.sqrt((mine**2).mean()))
+                self._noise[kind] = float(np.clip(noise, *_NOISE))
 
     def by_sighting(self, residual: Floats, of: Callable[[Floats], Any]) -> Floats:
         """(v,) a figure of the distances in each sighting, px."""
-        pairs = residual[self._rows["corner"]].reshape(-1, 2) * _SD_PX["corner"]
+        pairs = (residual[self._rows["corner"]] * self.sd_px("corner")).reshape(-1, 2)
         distance = np.linalg.norm(pairs, axis=1)
         views = range(len(self._sightings))
         return np.array([float(of(distance[self._view == v])) for v in views])
 
     def slips(self, x: Floats) -> Floats:
         """(v, a) corrections of readings."""
-        if self.slip_sd == 0:
-            return np.zeros_like(self._readings)
-        return x[self._shared :].reshape(self._readings.shape)
+        out = np.zeros_like(self._readings)
+        out[:, self._slip_sd > 0] = x[self._shared :].reshape(len(out), -1)
+        return out
 
     def geometry(self, x: Floats) -> Geometry:
         """The geometry at an offset."""
@@ -166,15 +187,13 @@ class Problem:
             parts += self._mirrored(geometry, x)
         residuals = [part[0] for part in parts]
         jacobians = [self._sparse(*part[1:]) for part in parts]
-        if self.slip_sd > 0:
-            residuals.append(x[self._shared :] / self.slip_sd)
-            free = self.size - self._shared
+        free = self.size - self._shared
+        if free:
+            weight = 1 / self.scale[self._shared :]
+            residuals.append(x[self._shared :] * weight)
             jacobians.append(
                 sparse.csr_array(
-                    (
-                        np.full(free, 1 / self.slip_sd),
-                        (np.arange(free), self._shared + np.arange(free)),
-                    ),
+                    (weight, (np.arange(free), self._shared + np.arange(free))),
                     shape=(free, self.size),
                 )
             )
@@ -196,8 +215,11 @@ class Problem:
             scales.extend(scale for _, scale in entries)
             gives.extend([give] * len(entries))
 
-        focal = start.camera.parameters[0]
-        lens = {name: part * focal for name, part in _SCALE_PX.items()} | _SCALE_LENS
+        camera = start.camera
+        focal = camera.parameters[0]
+        corner = np.hypot(camera.width, camera.height) / 2 / focal
+        lens = {name: part * focal for name, part in _SCALE_PX.items()}
+        lens |= {name: part / corner ** _POWER_LENS[name] for name, part in _SCALE_LENS.items()}
         block("lens", [(f"camera.{name}", lens[name]) for name in PARAMETERS], _LENS_GIVES_UP)
         block("camera_pose", _pose_names("camera_pose"))
         for axis in start.kinematics.axes:
@@ -211,11 +233,12 @@ class Problem:
         for name in start.lights_mm:
             block(f"light.{name}", [(f"light.{name}.{k}", _SCALE_LIGHT_MM) for k in "xyz"])
         self._shared = len(names)
-        if self.slip_sd > 0:
-            block(
-                "slips",
-                [(f"slip.{f}.{a}", self.slip_sd) for f in self._frames for a in self.axis_names],
-            )
+        slips = [
+            (name, sd)
+            for name, sd in zip(self.axis_names, self._slip_sd.tolist(), strict=True)
+            if sd > 0
+        ]
+        block("slips", [(f"slip.{f}.{name}", sd) for f in self._frames for name, sd in slips])
         self.names, self.scale, self.give_up = tuple(names), np.array(scales), np.array(gives)
 
     def _observations(self) -> None:
@@ -224,6 +247,15 @@ class Problem:
         )
         self._points = np.concatenate([s.points_mm for s in self._sightings])
         self._pixels = np.concatenate([s.pixels for s in self._sightings])
+        self._noise = dict.fromkeys(_SD_PX, 1.0)
+        self._corner_sd = np.concatenate(
+            [
+                np.full((len(s.pixels), 2), _SD_PX["corner"])
+                if s.sd_px is None
+                else np.maximum(s.sd_px, _LEAST_PX)
+                for s in self._sightings
+            ]
+        )
         self._on_board = np.array([s.on == "board" for s in self._sightings])[self._view]
         first = len(self._sightings)
         self._outline_of = np.repeat(
@@ -274,7 +306,7 @@ class Problem:
             shared = (by_centre[:, None] @ centres.shared[of])[:, 0]
             shared[:, self._at["lens"]] += by_camera
             slip = (by_centre[:, None] @ centres.slip[of])[:, 0]
-            sd = _SD_PX["outline"]
+            sd = self._noise["outline"] * _SD_PX["outline"]
             parts.append((miss / sd, shared / sd, slip / sd, self._sphere_view[of]))
         if self._shown:
             at = np.array([k for k, _, _ in self._shown])
@@ -375,17 +407,22 @@ class Problem:
         lost = np.isnan(found.sum(axis=1))
         miss = np.where(lost[:, None], 1e4, found - pixels)
         shared[lost] = slip[lost] = 0
-        sd = _SD_PX[kind]
         rows = 2 * len(pixels)
-        flat = (miss / sd).reshape(rows)
+        sd = self.sd_px(kind)
         shape = (rows, -1)
-        return flat, shared.reshape(shape) / sd, slip.reshape(shape) / sd, np.repeat(view, 2)
+        return (
+            miss.reshape(rows) / sd,
+            shared.reshape(shape) / sd[:, None],
+            slip.reshape(shape) / sd[:, None],
+            np.repeat(view, 2),
+        )
 
     def _sparse(self, shared: Floats, slip: Floats, view: Index) -> sparse.csr_array:
         rows = len(shared)
-        if self.slip_sd == 0:
-            return sparse.csr_array(shared)
+        slip = slip[:, self._slip_sd > 0]
         count = slip.shape[1]
+        if count == 0:
+            return sparse.csr_array(shared)
         columns = view[:, None] * count + np.arange(count)
         row = np.broadcast_to(np.arange(rows)[:, None], columns.shape)
         apart = sparse.csr_array(

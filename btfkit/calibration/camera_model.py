@@ -103,7 +103,8 @@ class Camera:
                 across, down = off[..., 0], off[..., 1]
                 step = np.stack([d * across - b * down, a * down - c * across], -1) / det[..., None]
             plane = plane + step
-            if not np.abs(step).max(initial=0.0) > 1e-15:
+            # One pixel that has no ray must not end the search for the others'.
+            if not np.nanmax(np.abs(step), initial=0.0) > 1e-15:
                 break
         with np.errstate(invalid="ignore"):
             lost = ~(np.abs(off).max(axis=-1) < 1e-9) | ((plane**2).sum(-1) >= self._fold())

@@ -31,6 +31,11 @@ _HIGHLIGHT = 0.3
 # Highlights are looked for within this share of a sphere's radius of where they should be.
 _SEARCH = 0.5
 _LOWEST_MM = 0.3
+_FEWEST_CORNERS = 6
+# Axes are first let stand this far from their readings, to see how far they do; from fewer frames
+# that cannot be told from where the axes are.
+_LOOSE = {"rotary": 1e-3, "linear": 0.1}
+_FEWEST_FOR_SLIPS = 8
 
 
 @final
@@ -40,15 +45,18 @@ class Found:
 
     Attributes:
         adjustment: the geometry and how well it is known. single: the camera by itself.
+        slip_sd: how far axes stand from their readings, rms, radians or mm.
     """
 
     adjustment: Adjustment
     single: SingleCamera
+    slip_sd: Mapping[str, float]
 
     def to_json(self) -> dict[str, Any]:
         return {
             **self.adjustment.to_json(),
             "blur_px": self.single.blur_px,
+            "axes_off": dict(self.slip_sd),
             "single_camera": {
                 "residual_px": self.single.residual_px,
                 "rejected": self.single.rejected,
@@ -78,12 +86,14 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
     if first is not None:
         placed = Geometry.placed(single.camera, start.kinematics, start.board, *first)
         start = replace(start, camera=single.camera, camera_pose=placed.camera_pose)
-    # The axes first: spheres are then found where they are.
-    alone = adjust(
-        replace(start, lights_mm={}, spheres_mm=np.zeros((0, 3)), radii_mm=np.zeros(0)), sightings
-    )
+    # The axes first: board and spheres are then found where they are.
+    bare = replace(start, lights_mm={}, spheres_mm=np.zeros((0, 3)), radii_mm=np.zeros(0))
+    alone = adjust(bare, sightings).geometry
+    sightings = _seen_again(pictures, frames, board, alone, single.blur_px)
+    slip_sd = slips_of(alone, sightings)
+    first_fit = adjust(alone, sightings, slip_sd=slip_sd)
     rough = replace(
-        alone.geometry,
+        first_fit.geometry,
         spheres_mm=start.spheres_mm,
         radii_mm=start.radii_mm,
         lights_mm=start.lights_mm,
@@ -95,7 +105,45 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
             *_grey(radiometry, sequence, group), rough, sequence.frames[group[0]]
         )
     ]
-    return Found(adjust(rough, sightings, spheres) if spheres else alone, single)
+    found = adjust(rough, sightings, spheres, slip_sd=slip_sd) if spheres else first_fit
+    return Found(found, single, slip_sd)
+
+
+def slips_of(start: Geometry, sightings: list[Sighting]) -> dict[str, float]:
+    """By how much each axis stands off its readings, rms, radians or mm, as the board tells.
+
+    An axis that moves neither sample nor camera is taken to be as good as the worst of its kind.
+    """
+    kinematics = start.kinematics
+    loose = {axis.name: _LOOSE[axis.kind] for axis in kinematics.axes}
+    if len(sightings) < _FEWEST_FOR_SLIPS:
+        return {}
+    slips = adjust(start, sightings, slip_sd=loose).slips
+    size = np.sqrt((slips**2).mean(axis=0))
+    told = {*kinematics.chains.get("sample", ()), *kinematics.chains.get("camera", ())}
+    own = {axis.name: float(s) for axis, s in zip(kinematics.axes, size, strict=True)}
+    worst = {
+        kind: max((own[a.name] for a in kinematics.axes if a.name in told and a.kind == kind),
+                  default=0.0)
+        for kind in _LOOSE
+    }  # fmt: skip
+    return {a.name: own[a.name] if a.name in told else worst[a.kind] for a in kinematics.axes}
+
+
+def _seen_again(
+    pictures: list[Floats], frames: list[Frame], board: Board, rig: Geometry, blur_px: float
+) -> list[Sighting]:
+    """Every corner that frames show, from where the rig puts the board: detection misses some."""
+    every = np.arange(len(board.corners_mm))
+    found = []
+    for picture, frame in zip(pictures, frames, strict=True):
+        pose = rig.sample_to_camera(frame.axes) @ rig.board
+        pixels, sd = board.refine(picture, every, rig.camera, pose, blur_px=blur_px)
+        good = np.isfinite(pixels).all(axis=1) & np.isfinite(sd).all(axis=1)
+        if good.sum() >= _FEWEST_CORNERS:
+            corners = board.corners_mm[good]
+            found.append(Sighting(frame.file, frame.axes, corners, pixels[good], sd_px=sd[good]))
+    return found
 
 
 def nominal(sequence: Sequence) -> Geometry:

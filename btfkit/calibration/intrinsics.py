@@ -25,6 +25,7 @@ _REJECT = 5.0
 _LEAST_PX = 0.01
 _FEWEST_VIEWS = 3
 _ROUNDS = 2
+_BLUR_VIEWS = 3
 # Views whose boards are more nearly parallel than this tell no focal length.
 _LEAST_TILT_DEG = 5.0
 # Relative standard deviation above which a focal length is not known.
@@ -80,7 +81,7 @@ def calibrate_camera(
         images: (h, w) linear frames of one camera with the board in view.
         board: what is seen.
         blur_px: standard deviation of the lens's blur, beside the pixel's own square; None
-            measures it on the view that looks at the board most squarely.
+            measures it on those views that look at the board most squarely.
 
     Raises:
         CalibrationError: fewer than three frames show the board, or their views are too alike.
@@ -100,9 +101,11 @@ def calibrate_camera(
     _refuse_parallel(views)
     camera, views, sd, rejected = _settled(views, board, width, height)
     if blur_px is None:
-        square = int(np.argmax([abs(view.pose.rotation[2, 2]) for view in views]))
-        seen = views[square]
-        blur_px = board.blur(images[usable[square]], seen.numbers, camera, seen.pose)
+        squarest = np.argsort([-abs(view.pose.rotation[2, 2]) for view in views])[:_BLUR_VIEWS]
+        blurs = [
+            board.blur(images[usable[v]], views[v].numbers, camera, views[v].pose) for v in squarest
+        ]
+        blur_px = float(np.median(blurs))
     every = np.arange(len(board.corners_mm))
     for turn in range(_ROUNDS):
         # All corners that frames may show, those that detection missed among them; then the good.
@@ -134,7 +137,7 @@ def _refined(
     blur_px: float,
 ) -> View:
     """The view with corners fitted to the frame, those of `numbers` that it shows."""
-    pixels = board.refine(image, numbers, camera, view.pose, blur_px=blur_px)
+    pixels, _ = board.refine(image, numbers, camera, view.pose, blur_px=blur_px)
     good = np.isfinite(pixels).all(axis=1)
     if good.sum() < 4:
         return view

@@ -143,6 +143,7 @@ def footprints(
     blur_px: float = 0.0,
     mosaic: bool = False,
     height_mm: Floats | None = None,
+    offset_mm: tuple[float, float] = (0.0, 0.0),
 ) -> Footprints:
     """The footprints of texels in a frame.
 
@@ -153,8 +154,9 @@ def footprints(
         blur_px: standard deviation of the lens's own blur.
         mosaic: whether frames are mosaics, whose colours lie farther apart.
         height_mm: (h, w) of a relief; texels are then looked for on it.
+        offset_mm: by how much the frame shows them displaced on the sample, x and y.
     """
-    points = grid.points(height_mm)
+    points = grid.points(height_mm) + np.array([*offset_mm, 0.0])
     place, by_point, _ = camera.project_with_derivatives(pose(points))
     # Texels step along +x with columns and along -y with rows.
     steps = pose.rotation[:, :2] * [grid.texel_mm, -grid.texel_mm]

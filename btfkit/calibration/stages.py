@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,12 +27,13 @@ from btfkit.calibration.references import (
 from btfkit.calibration.sensor_stage import fit_sensor, frames_used
 from btfkit.calibration.stray import Stray
 from btfkit.calibration.white import Scale
+from btfkit.errors import CalibrationError
 from btfkit.sequence import Sequence as Frames
 
 Progress = Callable[[float, float], None]
 ORDER = ("radiometry", "lamp", "geometry", "stray", "white", "colour")
 # Raised with what a stage computes: sections of older code are made again.
-_REVISION = {"radiometry": 1, "lamp": 1, "geometry": 2, "stray": 1, "white": 1, "colour": 1}
+_REVISION = {"radiometry": 1, "lamp": 1, "geometry": 3, "stray": 1, "white": 1, "colour": 1}
 _NEEDED = {"radiometry"}
 
 
@@ -73,6 +75,27 @@ def calibrate(
             placed = placed_by(found) or placed
         progress(done + 1, len(ORDER))
     return found, ran
+
+
+def refuse_unfit(sequence: Frames, found: Calibration, path: Path) -> None:
+    """Refuse a calibration that was made from other frames or settings than a sequence's.
+
+    Raises:
+        CalibrationError: names the first stage whose inputs differ.
+    """
+    placed = placement_of(sequence)
+    for name in ORDER:
+        if name not in found.sections:
+            continue
+        if found.fresh(name, fingerprint(sequence, name, found, placed)) is None:
+            raise CalibrationError(
+                f"{path}: its section {name!r} was not made from the frames and settings of "
+                f"{sequence.path}",
+                remedy=f"run btfkit calibrate {sequence.path} -o ANOTHER.json, or leave out "
+                "--calibration",
+            )
+        if name == "geometry":
+            placed = placed_by(found) or placed
 
 
 def geometry_of(found: Calibration) -> Geometry:

@@ -88,9 +88,10 @@ def _calibrated(
         raise FileNotFoundError(f"{source} is not a folder")
     if (source / TABLE).exists():
         data = calibrate_sequence(source, out, force=force, progress=bar)
+        then = f"btfkit ingest {shlex.quote(str(source))}"
         # A document elsewhere is not read along with the sequence.
-        beside = data["out"] == source / NAME
-        then = f"btfkit ingest {shlex.quote(str(source))}" if beside else None
+        if data["out"] != source / NAME:
+            then += f" --calibration {shlex.quote(str(data['out']))}"
         return Outcome(_of_sequence(data), data, then=then)
     data = calibrate_photographs(source, out, Photographs(**options), force=force, progress=bar)
     return Outcome(_of_lights(data), data, then=f"btfkit ingest {shlex.quote(str(data['out']))}")

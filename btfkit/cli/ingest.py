@@ -42,6 +42,17 @@ btfkit ingest wool/ felt.zip cord.btf --cluster local:2 -o stores""",
 @click.option(
     "--light-shift", type=click.Path(path_type=Path), help="Table of shifted lights (UTIA)."
 )
+@click.option(
+    "--calibration", type=click.Path(path_type=Path), help="Calibration of a captured sequence."
+)
+@click.option(
+    "--register/--no-register", default=None,
+    help="Move each view of a sequence onto the squarest; by default where calibration is poor.",
+)  # fmt: skip
+@click.option(
+    "--relief", type=click.Path(path_type=Path), help="Heights of a sequence's sample, to register."
+)
+@click.option("--partial", is_flag=True, default=None, help="Take a run with gaps, masking them.")
 @click.option("--dtype", type=click.Choice(["float16", "float32"]), help="Of the stored textures.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Workers; by default one a processor.")
 @cluster_option
@@ -121,6 +132,7 @@ def _written(path: Location, *, preview: bool) -> Outcome:
             "channels": btf.channels,
             "format": btf.provenance["format"],
             "assumed": btf.provenance.get("assumed", {}),
+            **{k: btf.provenance[k] for k in ("registration", "partial") if k in btf.provenance},
             **(of_btf(btf, path) if preview and isinstance(path, Path) else {}),
         },
         then=f"btfkit fit {shlex.quote(str(path))}",

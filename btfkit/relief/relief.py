@@ -15,7 +15,6 @@ Array = NDArray[np.float32]
 # Heights of more tiles than this are a scale gone wrong, and every ray would cross them all.
 _MOST_HEIGHT = 100.0
 # In the maps' own precision, whose 0.02 is a little less than that of float64.
-# As float32 has it: numpy before 2 would compare in float64.
 _LEAST_ROUGHNESS = np.float32(0.02)
 
 

@@ -10,7 +10,7 @@ import sources
 
 import btfkit
 from btfkit import counts
-from btfkit.calibration.captured import CapturedTextures
+from btfkit.calibration.captured_textures import CapturedTextures
 from btfkit.errors import CalibrationError, FormatError
 from btfkit.sequence import Sequence
 
@@ -81,16 +81,16 @@ def test_only_the_frames_of_the_asked_pair_are_read_and_variance_costs_nothing_m
 
 
 def test_a_window_merges_only_the_pixels_that_it_needs(run, monkeypatch):
-    from btfkit.calibration import captured
+    from btfkit.calibration import windows
 
     merged = []
-    real = captured.merge_exposures
+    real = windows.merge_exposures
 
     def spied(raw, *rest, **options):
         merged.append(raw[0].shape)
         return real(raw, *rest, **options)
 
-    monkeypatch.setattr(captured, "merge_exposures", spied)
+    monkeypatch.setattr(windows, "merge_exposures", spied)
     btf = btfkit.open(run, texel_mm=0.5)
     part = btf.crop(slice(4, 8), slice(3, 6))
     whole = btf.texture(1)
@@ -154,9 +154,7 @@ def test_a_sample_seen_from_below_has_no_valid_texel(run):
 
 @pytest.mark.parametrize("cfa", ["none", "RGGB", "three colours"])
 def test_stray_light_of_a_window_is_that_of_the_whole_frame(cfa):
-    from types import SimpleNamespace
-
-    from btfkit.calibration import captured
+    from btfkit.calibration import windows
     from btfkit.calibration.merge import Merged
     from btfkit.calibration.noise import Fitted, NoiseModel
     from btfkit.calibration.radiometry import Radiometry
@@ -186,9 +184,8 @@ def test_stray_light_of_a_window_is_that_of_the_whole_frame(cfa):
         )
 
     window = slice(20, 61), slice(40, 95)
-    rig = SimpleNamespace(stray=stray, radiometry=radiometry)
-    every = captured._EVERY
-    found = captured._without_stray(rig, part(window), part((every, every)), window)
+    every = windows.EVERY
+    found = windows.without_stray(radiometry, stray, part(window), part((every, every)), window)
     expected = stray.removed(whole, radiometry.lens(shape), colours).radiance[window]
     # A fortieth of a slope's mean at the most, of which 2 % are stray light.
     np.testing.assert_allclose(found.radiance, expected, rtol=5e-4)

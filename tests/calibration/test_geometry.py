@@ -170,11 +170,11 @@ def test_derivatives_of_a_tilting_turning_sample_and_the_optimum_are_those_of_au
     )
     residual = residuals(*given).numpy()
     jacobians = torch.autograd.functional.jacobian(residuals, given)
-    problem = Problem(best, seen, (), slip_sd=0.0)
+    problem = Problem(best, seen, (), slip_sd={})
     ours, slopes = problem.evaluate(np.zeros(problem.size))
     scale = problem.sd_px("corner")
     np.testing.assert_allclose(ours * scale, residual, atol=1e-9)
-    slopes = slopes.toarray() * scale
+    slopes = slopes.toarray() * scale[:, None]
     # 1e-8 of pixels a unit: both are float64
     np.testing.assert_allclose(slopes[:, :9], jacobians[0].numpy(), rtol=1e-8, atol=1e-7)
     np.testing.assert_allclose(slopes[:, 12:15], jacobians[1].numpy()[:, 3:], rtol=1e-8, atol=1e-7)
@@ -191,7 +191,7 @@ def test_derivatives_of_a_tilting_turning_sample_and_the_optimum_are_those_of_au
         assert (np.abs(slope) < 1e-5 * size).all()
 
 
-@pytest.mark.parametrize("slip_sd", [0.0, 1e-3])
+@pytest.mark.parametrize("slip_sd", [{}, {"tilt": 1e-3, "turn": 2e-3}])
 @pytest.mark.slow
 def test_derivatives_of_every_parameter_of_a_rig_with_spheres_are_differences_of_its_residuals(
     slip_sd,
@@ -465,7 +465,9 @@ def test_small_slips_of_the_axes_are_found_where_they_are_allowed():
         )
         for s, (a, b) in zip(seen, slip, strict=True)
     ]
-    found = adjust(nominal(rig, spheres=False), moved, slip_sd=5e-4)
+    found = adjust(
+        nominal(rig, spheres=False), moved, slip_sd={"tilt": 5e-4, "turn": 5e-4, "arm": 5e-4}
+    )
     # A mean slip of an axis cannot be told from where it reads zero.
     left = found.slips[:, :2] - slip
     # A third of what they were: the board's 0.01 px are 4e-5 of its half width.

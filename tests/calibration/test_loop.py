@@ -21,7 +21,7 @@ from btfkit.sequence import Sequence
 
 ENTRY = str(Path(sys.executable).with_name("btfkit"))
 PLAN = {"name": "small", "views": 4, "lights": 3, "reference_every": 30, "whites": 3,
-        "colours": 1, "targets": 16, "spheres": 8}  # fmt: skip
+        "colours": 1, "targets": 16, "spheres": 12}  # fmt: skip
 # What a run recovers from by itself, and meets sixty chances of in the second half of this plan.
 CURABLE = ("no-reply", "truncated", "bad-crc", "duplicate", "stall", "dropped-frame",
            "repeated-frame")  # fmt: skip

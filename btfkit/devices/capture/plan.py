@@ -79,7 +79,7 @@ class Plan:
     whites: int = 4
     colours: int = 1
     targets: int = 16
-    spheres: int = 8
+    spheres: int = 16
     reference_every: int = 100
     reference_level: float = 0.02
     reference_px: float = 0.5
@@ -167,7 +167,7 @@ def _named(name: str) -> dict[str, Any]:
     if name == "demo":
         return {"version": 1, "name": "demo", "views": 12, "lights": 12, "reference_every": 48,
                 "pairs": [[i, (5 * i + 3 * k) % 12] for i in range(12) for k in range(3)],
-                "exposures": {"count": 3}, "targets": 10, "spheres": 6}  # fmt: skip
+                "exposures": {"count": 3}, "targets": 10, "spheres": 12}  # fmt: skip
     return {"version": 1, "name": name, "views": name, "lights": name}
 
 

@@ -14,7 +14,6 @@ from btfkit.devices.capture.aim import Aim
 from btfkit.devices.capture.order import ordered, travel_s
 from btfkit.devices.capture.plan import Bracket, Plan, Ramp
 from btfkit.devices.poses import Floats
-from btfkit.relief.synth import direction_set
 
 # What a metered bracket is metered on: an area of the target, the whole frame, or its highlights.
 SAMPLE, WHITE, FRAME, HIGHLIGHT = "sample", "white", "frame", "highlight"
@@ -185,12 +184,14 @@ def _targets(count: int) -> tuple[Floats, Floats]:
 
 
 def _spheres(count: int) -> tuple[Floats, Floats]:
-    """From above and tilted in turn, lamps spread as far down as spheres show them.
+    """From above and tilted in turn, lamps from straight above to as low as spheres show them.
 
-    From above alone a sphere's height and the lamp's distance would move the highlights alike.
+    From above alone a sphere's height and the lamp's distance would move the highlights alike. Of
+    what was tried, lamps by turns high and low tell most of how the lamp's axes lie.
     """
-    lights = direction_set(str(count)).astype(np.float64) if count else np.zeros((0, 3))
     number = np.arange(count)
+    theta = np.array([0.0, 70.0, 40.0, 75.0])[number % 4]
+    lights = _degrees(theta.tolist(), (137.5 * number % 360).tolist())
     tilt = np.where(number % 2 == 1, _SPHERE_TILT_DEG, 0.0)
     # About the shorter side of the frame, which keeps all spheres within it.
     around = np.where(number % 4 == 3, 180.0, 0.0)
