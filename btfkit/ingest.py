@@ -50,7 +50,18 @@ class Part:
 def store_name(source: str | os.PathLike[str]) -> Path:
     """The store that a source becomes by default: `folder` -> `folder.btf.zarr`, here."""
     name = Path(source).resolve().name
-    for suffix in (".btf.zarr", ".btf", ".zip", ".json", ".csv", ".lp", ".bin", ".binary"):
+    for suffix in (
+        ".btf.zarr",
+        ".btf",
+        ".zip",
+        ".json",
+        ".csv",
+        ".lp",
+        ".bin",
+        ".binary",
+        ".hdf5",
+        ".h5",
+    ):
         if name.lower().endswith(suffix) and len(name) > len(suffix):
             name = name[: -len(suffix)]
             break

@@ -188,6 +188,17 @@ def _sequence(folder: Path) -> Path:
     return run
 
 
+def _hdf5(folder: Path) -> Path:
+    import h5py
+
+    btf = small_btf()
+    with h5py.File(folder / "leather_full.hdf5", "w") as file:
+        file["ground_light"] = btf.light[:, :2]
+        file["ground_camera_dir"] = btf.view[:, :2]
+        file["ground_color"] = np.stack([btf.texture(i) for i in range(PAIRS)])
+    return folder / "leather_full.hdf5"
+
+
 SOURCES: dict[str, Callable[[Path], Path]] = {
     "zarr": _zarr,
     "sequence": _sequence,
@@ -202,6 +213,7 @@ SOURCES: dict[str, Callable[[Path], Path]] = {
     "merl": _merl,
     "bonn": _bonn,
     "utia_brdf": _utia_brdf,
+    "hdf5": _hdf5,
 }
 # Folders of images: each may as well come as a zip.
 FOLDERS = ("manifest", "spectral", "ubo2003", "utia", "materialgan", "diligent", "lp")

@@ -30,6 +30,10 @@ from btfkit.cli.preview import of_btf, preview_option
 @click.option(
     "--light-shift", type=click.Path(path_type=Path), help="Table of shifted lights (UTIA)."
 )
+@click.option(
+    "--direction-residual", type=float,
+    help="Degrees that directions may be off from one position an image (HDF5; 0.2).",
+)  # fmt: skip
 @click.option("--dtype", type=click.Choice(["float16", "float32"]), help="Of the stored textures.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Workers; by default one a processor.")
 @preview_option

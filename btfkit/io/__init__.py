@@ -31,6 +31,7 @@ FORMATS: dict[str, str] = {
     "merl": "btfkit.io.merl",
     "bonn": "btfkit.io.bonn.reader",
     "utia_brdf": "btfkit.io.utia_brdf",
+    "hdf5": "btfkit.io.hdf5",
 }
 
 
