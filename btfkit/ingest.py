@@ -48,11 +48,17 @@ class Part:
         return btf.crop(self.rows, self.cols)
 
 
+# What a source's name loses.
+_SUFFIXES = (
+    ".btf.zarr", ".btf", ".zip", ".json", ".csv", ".lp", ".bin", ".binary", ".hdf5", ".h5",
+)  # fmt: skip
+
+
 def store_name(source: str | os.PathLike[str] | Remote) -> Path:
     """The store that a source becomes by default: `folder` -> `folder.btf.zarr`, here."""
     where = located(source)
     name = where.resolve().name if isinstance(where, Path) else where.name
-    for suffix in (".btf.zarr", ".btf", ".zip", ".json", ".csv", ".lp", ".bin", ".binary"):
+    for suffix in _SUFFIXES:
         if name.lower().endswith(suffix) and len(name) > len(suffix):
             name = name[: -len(suffix)]
             break

@@ -12,7 +12,7 @@ import numpy as np
 
 from btfkit import directions
 from btfkit.btf import BTF
-from btfkit.io import images, ubo2003, utia
+from btfkit.io import images, tensorfile, ubo2003, utia
 from btfkit.io.bonn import header, pack
 from btfkit.io.manifest import reader
 from btfkit.io.store import writer
@@ -188,6 +188,38 @@ def _sequence(folder: Path) -> Path:
     return run
 
 
+def _rgl(folder: Path) -> Path:
+    rng = np.random.default_rng(0)
+
+    def grid(*shape: int) -> np.ndarray:
+        return rng.uniform(0.2, 1, shape).astype(np.float32)
+
+    fields = {
+        "description": np.frombuffer(b"paper", np.uint8),
+        "phi_i": np.zeros(1, np.float32),
+        "theta_i": np.linspace(0, 1.4, 4, dtype=np.float32),
+        "ndf": grid(5, 6),
+        "sigma": grid(4, 3),
+        "vndf": grid(1, 4, 6, 5),
+        "luminance": grid(1, 4, 4, 4),
+        "rgb": grid(1, 4, 3, 4, 4),
+        "jacobian": np.ones(1, np.uint8),
+    }
+    (folder / "paper_rgb.bsdf").write_bytes(tensorfile.packed(fields))
+    return folder / "paper_rgb.bsdf"
+
+
+def _hdf5(folder: Path) -> Path:
+    import h5py
+
+    btf = small_btf()
+    with h5py.File(folder / "leather_full.hdf5", "w") as file:
+        file["ground_light"] = btf.light[:, :2]
+        file["ground_camera_dir"] = btf.view[:, :2]
+        file["ground_color"] = np.stack([btf.texture(i) for i in range(PAIRS)])
+    return folder / "leather_full.hdf5"
+
+
 SOURCES: dict[str, Callable[[Path], Path]] = {
     "zarr": _zarr,
     "sequence": _sequence,
@@ -200,8 +232,10 @@ SOURCES: dict[str, Callable[[Path], Path]] = {
     "diligent": _diligent,
     "lp": _lp,
     "merl": _merl,
+    "rgl": _rgl,
     "bonn": _bonn,
     "utia_brdf": _utia_brdf,
+    "hdf5": _hdf5,
 }
 # Folders of images: each may as well come as a zip.
 FOLDERS = ("manifest", "spectral", "ubo2003", "utia", "materialgan", "diligent", "lp")

@@ -22,6 +22,8 @@ WRITERS: dict[str, str] = {
     "utia": "btfkit.io.utia",
     "btf": "btfkit.io.bonn.write",
     "manifest": "btfkit.io.manifest.reader",
+    "merl": "btfkit.export.merl",
+    "bsdf": "btfkit.export.rgl",
 }
 
 

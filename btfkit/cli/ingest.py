@@ -53,6 +53,10 @@ btfkit ingest wool/ felt.zip cord.btf --cluster local:2 -o stores""",
     "--relief", type=click.Path(path_type=Path), help="Heights of a sequence's sample, to register."
 )
 @click.option("--partial", is_flag=True, default=None, help="Take a run with gaps, masking them.")
+@click.option(
+    "--direction-residual", type=float,
+    help="Degrees that directions may be off from one position an image (HDF5; 0.2).",
+)  # fmt: skip
 @click.option("--dtype", type=click.Choice(["float16", "float32"]), help="Of the stored textures.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Workers; by default one a processor.")
 @cluster_option

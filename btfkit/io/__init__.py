@@ -30,8 +30,10 @@ FORMATS: dict[str, str] = {
     "diligent": "btfkit.io.diligent",
     "lp": "btfkit.io.lp",
     "merl": "btfkit.io.merl",
+    "rgl": "btfkit.io.rgl",
     "bonn": "btfkit.io.bonn.reader",
     "utia_brdf": "btfkit.io.utia_brdf",
+    "hdf5": "btfkit.io.hdf5",
 }
 
 

@@ -21,11 +21,11 @@ from btfkit.errors import FormatError
 from btfkit.io import named
 from btfkit.textures import as_textures
 
-_BINS = (90, 90, 180)
-_SCALE = np.array([1.0, 1.15, 1.66]) / 1500
+BINS = (90, 90, 180)
+SCALE = np.array([1.0, 1.15, 1.66]) / 1500
 # No surface has an f_r like that; a flipped bit has.
 MOST = 1e9
-_TABLES = {"bonn81": directions.bonn81, "bonn151": directions.bonn151}
+TABLES = {"bonn81": directions.bonn81, "bonn151": directions.bonn151}
 
 
 def detect(path: Path) -> bool:
@@ -34,7 +34,7 @@ def detect(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         start = file.read(8)
-    return start == np.array(_BINS[:2], "<i4").tobytes() or path.suffix.lower() == ".binary"
+    return start == np.array(BINS[:2], "<i4").tobytes() or path.suffix.lower() == ".binary"
 
 
 def read(path: Path, *, sampling: str | None = None) -> BTF:
@@ -48,9 +48,9 @@ def read(path: Path, *, sampling: str | None = None) -> BTF:
         FormatError: other numbers of bins, or not the bytes they need.
     """
     values, record = named.assumptions(sampling=(sampling, "bonn81"))
-    if values["sampling"] not in _TABLES:
-        raise ValueError(f"sampling {values['sampling']!r}; expected {' or '.join(_TABLES)}")
-    table = _TABLES[values["sampling"]]()
+    if values["sampling"] not in TABLES:
+        raise ValueError(f"sampling {values['sampling']!r}; expected {' or '.join(TABLES)}")
+    table = TABLES[values["sampling"]]()
     pairs = np.array(list(itertools.product(range(len(table)), repeat=2)))
     light, view = table[pairs[:, 0]], table[pairs[:, 1]]
     brdf = lookup(_planes(path), light, view)
@@ -91,9 +91,9 @@ def lookup(
     j = theta_diff / (np.pi / 2) * 90 + nudge
     k = (phi_diff % np.pi) / np.pi * 180 + nudge
     index = tuple(
-        np.clip(bins.astype(int), 0, size - 1) for bins, size in zip((i, j, k), _BINS, strict=True)
+        np.clip(bins.astype(int), 0, size - 1) for bins, size in zip((i, j, k), BINS, strict=True)
     )
-    found = np.moveaxis(planes[(slice(None), *index)], 0, -1) * _SCALE
+    found = np.moveaxis(planes[(slice(None), *index)], 0, -1) * SCALE
     invalid = ~((found >= 0) & (found < MOST)).all(axis=-1)
     found[invalid] = np.nan
     return found
@@ -104,11 +104,11 @@ def _planes(path: Path) -> NDArray[np.float64]:
     with path.open("rb") as file:
         start = file.read(12)
     bins = tuple(np.frombuffer(start, "<i4").tolist()) if len(start) == 12 else ()
-    if bins != _BINS:
+    if bins != BINS:
         raise FormatError(
-            path, f"bins {bins}; expected {_BINS}", remedy="only the isotropic form is read"
+            path, f"bins {bins}; expected {BINS}", remedy="only the isotropic form is read"
         )
-    expected = 12 + 3 * 8 * int(np.prod(_BINS))
+    expected = 12 + 3 * 8 * int(np.prod(BINS))
     if size != expected:
         raise FormatError(path, f"{size} bytes; expected {expected}", remedy="copy it again")
-    return np.memmap(path, "<f8", "r", 12, (3, *_BINS))
+    return np.memmap(path, "<f8", "r", 12, (3, *BINS))
