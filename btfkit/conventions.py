@@ -15,7 +15,7 @@ LOWEST_COSINE = 0.6
 LEAST_FACING = 0.02
 # Looks at most along a view ray through heights.
 LOOKS = 8
-# Looks at most along a view ray that curvature lets leave the heights again.
+# Looks at most along a view ray that curvature lets leave the heights again, unless a model says.
 CURVED_LOOKS = 16
 # Looks a texel along such a ray; along others there is one.
 CURVED_FINER = 2.0
@@ -23,6 +23,11 @@ CURVED_FINER = 2.0
 MOST_BEND = 0.9
 # Lowest cosine of a view where its ray meets curved heights, as layers take it.
 LOWEST_SEEN = 0.02
+# Opacity above which a ray that ends is stopped by a height, not by the rim of a hole.
+WHOLE = 0.55
+# Share of their range, from the surface down, by which heights with holes lie higher than they
+# say: no ray ends between the lowest of them and their underside by rounding. The least range.
+SLACK, LEAST_RANGE = 1e-4, 1e-6
 # What a curvature is compared with, as an input, 1 / tile width.
 CURVATURE_UNIT = 16.0
 # Lowest cosine of a view ray through heights: 84 degrees.
@@ -88,6 +93,9 @@ def header() -> str:
         "kLowestSeen": LOWEST_SEEN,
         "kCurvedFiner": CURVED_FINER,
         "kCurvatureUnit": CURVATURE_UNIT,
+        "kWhole": WHOLE,
+        "kSlack": SLACK,
+        "kLeastRange": LEAST_RANGE,
     }
     inputs = ["k" + "".join(part.title() for part in name.split("_")) for name in KERNEL_INPUTS]
     names = ", ".join(f'"{name}"' for name in KERNEL_INPUTS)
@@ -99,7 +107,6 @@ def header() -> str:
             "namespace conventions {",
             *(f"constexpr float {name} = {float(value)!r}f;" for name, value in numbers.items()),
             f"constexpr int kLooks = {LOOKS};",
-            f"constexpr int kCurvedLooks = {CURVED_LOOKS};",
             f"enum Input {{ {', '.join(inputs)}, kInputs }};",
             f"constexpr const char* kInputNames[] = {{{names}}};",
             "}  // namespace conventions",

@@ -22,7 +22,7 @@ from typing import Any, Literal, final
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.conventions import INPUTS
+from btfkit.conventions import CURVED_LOOKS, INPUTS
 
 Floats = NDArray[Any]
 Activation = Literal["linear", "relu", "leaky", "sine"]
@@ -86,11 +86,17 @@ class Heights:
         heights: (h, w), units of `scale`; bilinear between texel centres.
         scale: tile widths a unit.
         curved: whether curvature bends the ray, which may then pass the heights: opacity 0.
+        opacity: (h, w) 0 to 1 of curved heights, bilinear; None where nothing is seen through.
+            Where it is below 1/2 there is nothing at any height. The lowest height is then the
+            underside of the sheet: a ray that gets below it has passed.
+        looks: at most along a ray that may pass.
     """
 
     heights: Floats
     scale: float
     curved: bool = False
+    opacity: Floats | None = None
+    looks: int = CURVED_LOOKS
 
 
 @final

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from btfkit import directions
 from btfkit.btf import BTF
+from btfkit.fitting.sbtf.holes import seen_through
 from btfkit.queries import QuerySet
 
 # Fewer pairs say little about gloss; fewer than the second are told apart by their neighbours.
@@ -48,14 +49,13 @@ def choose(source: BTF | QuerySet) -> Choice:
 def _for_queries(queries: QuerySet) -> Choice:
     valid = queries.subset(queries.valid())
     bend = np.zeros(len(valid)) if valid.curvature is None else valid.curvature
-    holes = valid.opacity is not None and bool(np.any(valid.opacity[bend == 0] < 1))
-    unfitted = "what is seen through on the plane is not fitted: no model here knows holes"
-    if np.any(bend != 0):
-        reasons = ["sbtf: the queries have curvature, under which rays may pass the material"]
-        return Choice("sbtf", (*reasons, unfitted) if holes else tuple(reasons))
+    holes = seen_through(valid)
+    if np.any(bend != 0) or holes:
+        curved = "the queries have curvature, under which rays may pass the material"
+        through = "rays pass on the plane, through holes that heights alone do not have"
+        told = [curved] * bool(np.any(bend != 0)) + [through] * holes
+        return Choice("sbtf", tuple(f"sbtf: {reason}" for reason in told))
     reasons = ["neumip: queries have no images that could guide a texture"]
-    if holes:
-        reasons.append(unfitted)
     settings = {}
     if valid.footprint is None or not np.any(valid.footprint > 0.5):
         settings["levels"] = "1"

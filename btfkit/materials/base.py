@@ -101,6 +101,8 @@ class Material(ABC):
         spec: what decides the shapes.
         weights: arrays by name, as `shapes` lists them.
         header: what the answers mean and where the material comes from.
+        thickness: how deep below its surface rays may go, tile widths, where the material knows
+            it and curvature; else 0.
     """
 
     model: ClassVar[str]
@@ -109,6 +111,7 @@ class Material(ABC):
     has_curvature: ClassVar[bool] = False
     full_sphere: ClassVar[bool] = False
     computed: ClassVar[bool] = False
+    thickness: float = 0.0
 
     def __init__(self, spec: Any, weights: Mapping[str, NDArray[Any]], header: Header) -> None:
         expected = self.shapes(spec, header)

@@ -53,6 +53,7 @@ class TracedRelief(Material):
             provenance=dict(relief.provenance),
         )
         super().__init__(spec or TracedSpec(), {}, header)
+        self.thickness = max(-float(relief.height.min()), 0.0)
         self._relief, self._geometry = relief, geometry(relief)
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -127,6 +127,32 @@ def woven(size: int, depth: float, rng: np.random.Generator) -> Relief:
     )
 
 
+def gauze(size: int, depth: float, rng: np.random.Generator) -> Relief:
+    """Open plain weave: thin yarns over and under each other, and holes between them."""
+    yarns, reach = max(4, size // 16 // 2 * 2), 0.34
+    v, u = _grid(size)
+    lifts, shade = [], []
+    for along, across in ((v, u), (u, v)):
+        at = across * yarns
+        profile = np.clip(1 - (((at % 1) - 0.5) / reach) ** 2, 0, 1)
+        # Up where the other kind of yarn is down.
+        side = 1.0 if along is v else -1.0
+        bend = 0.5 + 0.5 * side * np.cos(np.pi * (along * yarns - 0.5)) * (
+            1 - 2 * (np.floor(at) % 2)
+        )
+        lifts.append(np.where(profile > 0, 0.15 + 0.45 * bend + 0.4 * np.sqrt(profile), 0))
+        shade.append(1 + 0.1 * rng.standard_normal(1024)[np.floor(at).astype(int) % 1024])
+    is_warp = lifts[0] >= lifts[1]
+    highest = np.maximum(*lifts)
+    colours = np.array([[0.55, 0.42, 0.2], [0.3, 0.12, 0.1]])
+    albedo = colours[1 - is_warp.astype(int)] * np.where(is_warp, *shade)[..., None]
+    tangent = np.where(is_warp, np.pi / 2, 0.0)
+    return _relief(
+        "gauze", depth * highest, albedo, 0.05, 0.25, across=np.full((size, size), 0.5),
+        tangent=tangent, opacity=(highest > 0).astype(np.float32),
+    )  # fmt: skip
+
+
 def knit(size: int, depth: float, rng: np.random.Generator) -> Relief:
     """Stockinette: columns of V-shaped stitches, each drawn through the one below."""
     wales = max(4, size // 24)
@@ -240,6 +266,7 @@ def gravel(size: int, depth: float, rng: np.random.Generator) -> Relief:
 CATALOGUE: dict[str, tuple[Maker, float]] = {
     "cobbles": (cobbles, 8.0),
     "woven": (woven, 1.5),
+    "gauze": (gauze, 3.0),
     "knit": (knit, 3.0),
     "scratched": (scratched, 0.4),
     "perforated": (perforated, 3.0),

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.materials.base import Material
+from btfkit.render.chords import chords, rotation
 from btfkit.shapes.closed import Floats, Shape, Surface
 
 # Interpolated normals may turn from the eye at silhouettes; a material is seen from above.
@@ -57,6 +58,15 @@ def gaze(material: Material, shape: Shape, surface: Surface, toward: Floats, pix
     if material.has_curvature:
         along = _bend_along(surface.bend, dot(x, toward), dot(right_handed, toward))
         curvature = side * shape.tile * along
+        ray = uv_step(surface, dot(surface.normal, toward)[:, None] * surface.normal - toward)
+        found = chords(
+            shape, surface, toward, np.where((side > 0)[:, None], view, 1.0), ray,
+            aspect=material.header.aspect, thickness=material.thickness,
+        )  # fmt: skip
+        if found is not None:
+            seen = view[found.rows] / np.linalg.norm(view[found.rows], axis=1, keepdims=True)
+            frame[found.rows] = rotation(seen, found.view) @ frame[found.rows]
+            view[found.rows], curvature[found.rows] = found.view, found.curvature
     footprint = _footprint(material, surface, toward, pixel)
     uv = surface.uv - np.floor(surface.uv)
     return Gaze(frame, uv, view, footprint, curvature, side > 0)
@@ -76,12 +86,12 @@ def _footprint(material: Material, surface: Surface, toward: Floats, pixel: Floa
     for step in pixel:
         # The step of the pixel, carried along the ray onto the surface.
         slide = step - toward * (surface.flat @ step / cosine)[:, None]
-        variance += np.square(_uv_step(surface, slide) * grid).sum(axis=1) / 8
+        variance += np.square(uv_step(surface, slide) * grid).sum(axis=1) / 8
     footprint = np.sqrt(variance)
     return footprint if material.has_levels else np.minimum(footprint, 0.5)
 
 
-def _uv_step(surface: Surface, step: Floats) -> Floats:
+def uv_step(surface: Surface, step: Floats) -> Floats:
     """Steps in uv (m, 2), tiles, for steps on the surface (m, 3)."""
     du, dv = surface.du, surface.dv
     uu, uv, vv = dot(du, du), dot(du, dv), dot(dv, dv)

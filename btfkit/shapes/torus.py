@@ -8,8 +8,6 @@ import numpy as np
 
 from btfkit.shapes.closed import Floats, Meeting, Shape, Surface, exact, met_once, nearest
 
-# Radius of the ring's central circle and of its tube; the whole is of radius 1.
-_RING, _TUBE = 2 / 3, 1 / 3
 # Halvings alone bring any bracket of length 2 below what counts as resolved in that many steps.
 _STEPS, _RESOLVED = 48, 1e-14
 
@@ -20,15 +18,28 @@ class Torus(Shape):
 
     Tiles keep their proportions on the central circle where 2 `repeat` `aspect` is a whole number;
     else the nearest whole number of tiles goes around the tube.
+
+    Args:
+        repeat: a quarter of the tiles around the ring. aspect: tile width / tile height.
+        tube: radius of the tube; that of the ring's central circle is 1 - tube.
+        tiles: (around the ring, around the tube) in place of `repeat` and `aspect`.
     """
 
     convex: ClassVar[bool] = False
 
-    def __init__(self, *, repeat: int = 1, aspect: float = 1.0) -> None:
+    def __init__(
+        self,
+        *,
+        repeat: int = 1,
+        aspect: float = 1.0,
+        tube: float = 1 / 3,
+        tiles: tuple[int, int] | None = None,
+    ) -> None:
         self.half_height = 1.04
-        self._around = 4 * repeat
-        self._across = max(round(self._around * aspect * _TUBE / _RING), 1)
-        self.tile = 2 * np.pi * _RING / self._around
+        self._ring, self._tube = 1 - tube, tube
+        across = max(round(4 * repeat * aspect * tube / self._ring), 1)
+        self._around, self._across = tiles or (4 * repeat, across)
+        self.tile = 2 * np.pi * self._ring / self._around
 
     def meet(self, origin: Floats, direction: Floats, beyond: Floats) -> Meeting:
         # From the point of the ray that is nearest to the centre, the quartic has no cubic term.
@@ -39,10 +50,10 @@ class Torus(Shape):
         distance = np.full(len(origin), np.inf)
         if near.size:
             a, d, reach = at[near], direction[near], np.sqrt(1 - square[near])
-            k = square[near] + _RING**2 - _TUBE**2
-            p = 2 * k - 4 * _RING**2 * (d[:, 0] ** 2 + d[:, 1] ** 2)
-            q = -8 * _RING**2 * (a[:, 0] * d[:, 0] + a[:, 1] * d[:, 1])
-            c = k**2 - 4 * _RING**2 * (a[:, 0] ** 2 + a[:, 1] ** 2)
+            k = square[near] + self._ring**2 - self._tube**2
+            p = 2 * k - 4 * self._ring**2 * (d[:, 0] ** 2 + d[:, 1] ** 2)
+            q = -8 * self._ring**2 * (a[:, 0] * d[:, 0] + a[:, 1] * d[:, 1])
+            c = k**2 - 4 * self._ring**2 * (a[:, 0] ** 2 + a[:, 1] ** 2)
             roots = _quartic(p, q, c, reach) + middle[near, None]
             distance[near] = nearest(roots, beyond[near])
         return met_once(distance)
@@ -53,7 +64,7 @@ class Torus(Shape):
         from_axis = np.hypot(x, y)
         # Clockwise from the top, so that u runs right and v down there.
         ring = np.arctan2(x, y)
-        tube = np.arctan2(z, from_axis - _RING)
+        tube = np.arctan2(z, from_axis - self._ring)
         away = point[:, :2] / np.maximum(from_axis, 1e-12)[:, None]
         flat = np.zeros(len(point))
         east = np.stack([away[:, 1], -away[:, 0], flat], axis=1)
@@ -62,8 +73,8 @@ class Torus(Shape):
         south = np.stack([-sin * away[:, 0], -sin * away[:, 1], cos], axis=1)
         u, v = ring / (2 * np.pi) * self._around, (tube / (2 * np.pi) - 0.25) * self._across
         du = east * (2 * np.pi * from_axis / self._around)[:, None]
-        dv = south * (2 * np.pi * _TUBE / self._across)
-        bend = np.stack([cos / from_axis, flat, flat + 1 / _TUBE], axis=1)
+        dv = south * (2 * np.pi * self._tube / self._across)
+        bend = np.stack([cos / from_axis, flat, flat + 1 / self._tube], axis=1)
         return exact(point, normal, np.stack([u, v], axis=1) + 0.5, du, dv, bend)
 
 

@@ -150,11 +150,13 @@ def test_queries_with_curvature_ask_for_a_model_that_knows_it() -> None:
     assert choose(queries(curvature=0 * bend)).model == "neumip"
 
 
-def test_holes_on_the_plane_are_said_not_to_be_fitted() -> None:
+def test_holes_on_the_plane_ask_for_a_model_that_knows_them() -> None:
     bend = np.linspace(0, 1, 64)
-    for parts in ({}, {"curvature": bend}):
+    for parts, count in (({}, 1), ({"curvature": bend}, 2)):
         choice = choose(queries(opacity=bend, **parts))
-        assert any("no model here knows holes" in why for why in choice.reasons)
+        assert choice.model == "sbtf"
+        assert len(choice.reasons) == count
+        assert choice.reasons[-1].startswith("sbtf: rays pass on the plane, through holes")
 
 
 def test_fit_takes_what_was_chosen_and_the_user_has_the_last_word() -> None:

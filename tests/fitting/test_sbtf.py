@@ -12,6 +12,7 @@ import btfkit
 from btfkit import metrics
 from btfkit.errors import FitError
 from btfkit.fitting.fit import fit
+from btfkit.fitting.sbtf.holes import opacity_of, thickness_of
 from btfkit.fitting.sbtf.outlines import moved
 from btfkit.fitting.sbtf.tracing import queries_of
 from btfkit.materials.base import Header, Material
@@ -296,3 +297,51 @@ def test_light_passes_where_rays_pass() -> None:
     # Rays that pass the outline of the near side reach the far side's inner wall.
     assert (deep.radiance.sum(axis=2) > 0).sum() > 0
     assert deep.cover.sum() < solid.cover.sum()
+
+
+@cache
+def sheet() -> Relief:
+    return procedural.make("perforated", 36, relief_texels=2.5).under_surface()[0]
+
+
+def test_a_known_relief_with_holes_is_seen_through(tmp_path) -> None:
+    out = tmp_path / "a.safetensors"
+    settings = {"levels": 1, "batch": 512}
+    model = fit(sheet(), model="sbtf", steps=1, settings=settings, out=out).material
+    assert isinstance(model, SBTF)
+    assert model.spec.holes
+    # Half floats of units of 0.05; the underside is where the holes' floor is.
+    np.testing.assert_allclose(model.thickness, -sheet().height.min(), atol=1e-4)
+    queries = random_queries(sheet(), 4000, seed=8, samples=1, footprints=(0.0,))
+    assert queries.opacity is not None
+    opacity = model.evaluate(queries.uv, queries.light, queries.view, 0.5, 0.0).opacity
+    # Rims of holes: tests/native/test_bent.py.
+    assert metrics.iou(opacity, queries.opacity) > 0.85
+    assert metrics.iou(1 - opacity, 1 - queries.opacity) > 0.5
+    again, query = btfkit.load(out), on_cylinders(500, bends=(0.05, 0.3))
+    for found, wanted in zip(again.evaluate(*query), model.evaluate(*query), strict=True):
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_holes_and_thickness_are_found_in_queries() -> None:
+    queries = random_queries(sheet(), 60000, seed=8, samples=1)
+    assert queries.opacity is not None
+    opacity = opacity_of(queries, (36, 36), wrap=True)
+    assert sheet().opacity is not None
+    assert metrics.iou(opacity, sheet().opacity) > 0.9
+    truth, scale = -float(sheet().height.min()), 0.05
+    found = thickness_of(
+        np.minimum(sheet().height, 0) / np.float32(scale), sheet().opacity, queries,
+        scale=scale, aspect=1.0, wrap=True,
+    )  # fmt: skip
+    # To the tracer the rims of holes let rays pass, which makes it look thinner.
+    assert 0.4 < found * scale / truth < 1.3
+    solid = fit(queries, model="sbtf", steps=1, settings={"holes": "false", "batch": 512}).material
+    assert solid.evaluate(queries.uv, queries.light, queries.view).opacity.all()
+    with pytest.raises(ValueError, match="expected one of auto, true, false"):
+        fit(queries, model="sbtf", steps=1, settings={"holes": "some"})
+    silent = replace(queries, opacity=None)
+    with pytest.raises(FitError, match="holes=true, and the data say nothing of opacity"):
+        fit(silent, model="sbtf", steps=1, settings={"holes": "true"})
+    thick = fit(queries, model="sbtf", steps=1, settings={"thickness": 0.08, "batch": 512}).material
+    assert thick.thickness == pytest.approx(0.08, rel=1e-3)

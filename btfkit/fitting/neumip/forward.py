@@ -19,11 +19,13 @@ from btfkit.conventions import (
     LOWEST_COSINE,
     LOWEST_SEEN,
     STEEPEST,
+    WHOLE,
     displacement,
 )
 from btfkit.fitting.neumip.data import Batch
 from btfkit.native.neural import bent
 from btfkit.native.neural.layout import Layout, Network, Pyramid
+from btfkit.native.neural.lookup import bilinear as lookup
 from btfkit.program import Heights
 
 
@@ -56,9 +58,12 @@ def forward(
     elif layout.heights is not None:
         depth = ray_depth(layout, layout.surface(texels), uv, view)
     away, toward = step(light, layout), step(view, layout)
+    if layout.holes and curvature is None:
+        curvature = torch.zeros(len(uv), dtype=uv.dtype)
     if layout.curved and curvature is not None:
-        on_curve, turn = bent_depth(layout, layout.surface(texels), uv, view, curvature)
-        depth = torch.where((curvature != 0)[:, None], on_curve, depth)
+        on_curve, turn = bent_depth(layout, texels, uv, view, curvature)
+        follows = (curvature != 0) | layout.holes
+        depth = torch.where(follows[:, None], on_curve, depth)
         light, view = turned(light, view, torch.where(curvature != 0, turn, 0.0))
         known = directions(light, view, footprint, curvature)
     features = []
@@ -94,13 +99,13 @@ def ray_depth(layout: Layout, surface: Tensor, uv: Tensor, view: Tensor) -> Tens
 
 
 def bent_depth(
-    layout: Layout, surface: Tensor, uv: Tensor, view: Tensor, curvature: Tensor
+    layout: Layout, texels: Tensor, uv: Tensor, view: Tensor, curvature: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The same on a curved surface, and the turn (b,) of the ray, which has no gradient.
 
     `native.neural.bent` finds where the ray ends.
     """
-    found = Heights(surface.detach().numpy(), layout.depth_scale, True)
+    surface, found = layout.surface(texels), _heights(layout, texels)
     parts = [part.detach().numpy() for part in (view, curvature)]
     rays = bent.rays_of(found, parts[0], parts[1], layout.aspect)
     met = bent.meet(
@@ -114,6 +119,10 @@ def bent_depth(
     climb = (slope * along).sum(1).numpy()
     moved = rays.share / bent.clearance(rays, met.way, climb) * layout.depth_scale
     height = bilinear(surface[..., None], here.detach(), wrap=layout.wrap)
+    if found.opacity is not None:
+        # At the rim of a hole a height moves nothing.
+        end = here.detach().numpy()
+        moved = moved * (lookup(found.opacity[..., None], end, wrap=layout.wrap)[:, 0] > WHOLE)
     rise = (height - height.detach()) * torch.from_numpy(moved * met.opacity)[:, None]
     return torch.from_numpy(met.depth)[:, None] + rise, torch.from_numpy(met.turn)
 
@@ -130,15 +139,23 @@ def dark(layout: Layout, texels: Tensor, batch: Batch) -> NDArray[np.bool_]:
     """(b,) queries of a batch that see nothing of curved heights, or nothing that is lit."""
     if not layout.curved:
         return np.zeros(len(batch), bool)
-    if batch.curvature is None:
+    bend = batch.curvature
+    if bend is None and not layout.holes:
         return batch.light[:, 2] <= 0
-    found = Heights(layout.surface(texels).detach().numpy(), layout.depth_scale, True)
-    met = bent.meet(
-        found, batch.uv, batch.view, batch.curvature, aspect=layout.aspect, wrap=layout.wrap
+    bend = np.zeros(len(batch), batch.uv.dtype) if bend is None else bend
+    found = _heights(layout, texels)
+    met = bent.meet(found, batch.uv, batch.view, bend, aspect=layout.aspect, wrap=layout.wrap)
+    follows = (bend != 0) | layout.holes
+    light = bent.turned(batch.light, batch.view, np.where(bend != 0, met.turn, 0))
+    return (follows & (met.opacity == 0)) | (light[:, 2] <= 0)
+
+
+def _heights(layout: Layout, texels: Tensor) -> Heights:
+    cover = layout.cover(texels)
+    opacity = None if cover is None else cover.detach().numpy()
+    return Heights(
+        layout.surface(texels).detach().numpy(), layout.depth_scale, True, opacity, layout.looks
     )
-    curved = batch.curvature != 0
-    light = bent.turned(batch.light, batch.view, np.where(curved, met.turn, 0))
-    return (curved & (met.opacity == 0)) | (light[:, 2] <= 0)
 
 
 def _crossing(surface: Tensor, uv: Tensor, along: Tensor, *, wrap: bool) -> Tensor:

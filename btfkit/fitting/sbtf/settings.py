@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import final
 
+from btfkit.conventions import CURVED_LOOKS
 from btfkit.fitting.neumip.settings import Shared, Stepped
 
 
@@ -19,14 +20,26 @@ class Settings(Stepped):
             "auto" takes those of a relief and finds all others.
         outlines: whether the opacity of curved rows bounds heights that are found.
         curvature: whether layers are told the curvature where the data have some.
+        holes: whether the material may be seen through: "auto" where the data are, on the plane.
+        looks: at most along a ray that may pass; more see finer outlines and take longer.
+        thickness: from the surface to the underside of what has holes, tile widths; 0 finds it.
     """
 
     heights: str = "auto"
     outlines: bool = True
     curvature: bool = True
+    holes: str = "auto"
+    thickness: float = 0.0
+    looks: int = CURVED_LOOKS
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.holes not in ("auto", "true", "false"):
+            raise ValueError(f"holes = {self.holes!r}; expected one of auto, true, false")
+        if not 1 <= self.looks <= 256:
+            raise ValueError(f"looks = {self.looks}; expected 1 to 256")
+        if not 0 <= self.thickness <= 10:
+            raise ValueError(f"thickness = {self.thickness}; expected 0 to 10 tile widths")
         if self.heights not in ("auto", "found", "given"):
             raise ValueError(f"heights = {self.heights!r}; expected one of auto, found, given")
 

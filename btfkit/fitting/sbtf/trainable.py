@@ -14,18 +14,19 @@ from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.neumip.settings import INPUTS
 from btfkit.fitting.neumip.trainable import Marching
+from btfkit.fitting.sbtf import holes
 from btfkit.fitting.sbtf.outlines import moved
 from btfkit.fitting.sbtf.settings import Settings
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.materials.sbtf import material as sbtf
 from btfkit.native.neural.layout import Array
-from btfkit.native.neural.lookup import bilinear
 from btfkit.program import Heights
+from btfkit.queries import QuerySet
 from btfkit.relief.relief import Relief
 
-# Steps between looks at outlines, and rows of a look.
-_OUTLINE_STEPS, _OUTLINE_ROWS = 4, 2048
+# Steps between looks at outlines, and rows of a look; steps between looks at the thickness.
+_OUTLINE_STEPS, _OUTLINE_ROWS, _THICKNESS_STEPS = 4, 2048, 100
 
 
 @final
@@ -36,6 +37,8 @@ class SBTF(Marching[Settings]):
     material_type: ClassVar[type[evaluated.NeuMIPMaterial]] = sbtf.SBTF
     settings_type = Settings
     _given: Array | None = None
+    _opacity: Array | None = None
+    _thickness: float = 0.0
 
     def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:
         s, source = self.settings, self._data
@@ -50,6 +53,8 @@ class SBTF(Marching[Settings]):
             frames=min(s.frames, s.features // 3),
             heights=True,
             curved=True,
+            holes=self._has_holes(),
+            looks=s.looks,
             hidden=(s.width,) * 3,
             activation=s.activation,  # type: ignore[arg-type]
             directions=(*INPUTS[s.inputs], *told),
@@ -59,17 +64,37 @@ class SBTF(Marching[Settings]):
             networks=s.networks,  # type: ignore[arg-type]
         )
 
+    def _has_holes(self) -> bool:
+        if self.settings.holes != "auto":
+            known = isinstance(self._data, QuerySet) and self._data.opacity is not None
+            if self.settings.holes == "true" and not known:
+                raise FitError(
+                    "holes=true, and the data say nothing of opacity",
+                    remedy="fit a relief or queries with opacity",
+                )
+            return self.settings.holes == "true"
+        return isinstance(self._data, QuerySet) and holes.seen_through(self._data)
+
+    def _begin(self, rng: np.random.Generator) -> None:
+        super()._begin(rng)
+        if self.spec.holes:
+            assert isinstance(self._data, QuerySet)
+            valid = self._data.subset(self._data.valid())
+            self._opacity = holes.opacity_of(valid, self.spec.size, wrap=self.layout.wrap)
+            self._look_for_thickness()
+            self._keep_given()
+
     def know(self, relief: Relief) -> None:
-        """Take the heights of the relief behind the data, its top at 0."""
+        """Take the heights, and the holes, of the relief behind the data, its top at 0."""
         if self.settings.heights == "found":
             return
+        wrap = relief.wrap == "wrap"
         height = relief.under_surface()[0].height / np.float32(self.spec.depth_scale)
-        h, w = self.spec.size
-        if (h, w) != relief.size:
-            u, v = np.meshgrid((np.arange(w) + 0.5) / w, (np.arange(h) + 0.5) / h)
-            at = np.stack([u, v], axis=-1).reshape(-1, 2)
-            height = bilinear(height[..., None], at, wrap=relief.wrap == "wrap").reshape(h, w)
-        self._given = height.astype(np.float32)
+        self._given = holes.resized(height, self.spec.size, wrap=wrap)
+        if self.spec.holes and relief.opacity is not None:
+            self._opacity = holes.resized(relief.opacity, self.spec.size, wrap=wrap)
+            self._thickness = self.settings.thickness / self.spec.depth_scale
+            self._thickness = self._thickness or -float(self._given.min())
         self._keep_given()
 
     def step(self, progress: float) -> float:
@@ -79,6 +104,8 @@ class SBTF(Marching[Settings]):
                 remedy="leave heights out, and they are found",
             )
         loss = super().step(progress)
+        if self.spec.holes and self._given is None and self._steps % _THICKNESS_STEPS == 0:
+            self._look_for_thickness()
         self._keep_given()
         if self._outlined and self._given is None and self._steps % _OUTLINE_STEPS == 0:
             self._heed_outlines(progress)
@@ -101,12 +128,34 @@ class SBTF(Marching[Settings]):
         surface = self.layout.surface(texels)
         found = Heights(surface, self.layout.depth_scale, curved=True)
         passes = np.asarray(np.isnan(batch.target[rows]).all(axis=1))
+        if self._opacity is not None:
+            # What passes through a hole says nothing of heights.
+            solid = holes.solid_at(self._opacity, batch.uv[rows], wrap=self.layout.wrap)
+            rows, passes = rows[solid], passes[solid]
         surface += moved(
             found, batch.uv[rows], batch.view[rows], batch.curvature[rows], passes,
             aspect=self.layout.aspect, wrap=self.layout.wrap,
         )  # fmt: skip
 
+    def _look_for_thickness(self) -> None:
+        """How far the sheet reaches down, from the heights as they are and the rays that pass."""
+        assert self._opacity is not None
+        assert isinstance(self._data, QuerySet)
+        scale = self.layout.depth_scale
+        if self.settings.thickness:
+            self._thickness = self.settings.thickness / scale
+            return
+        _, texels = self.engine.parameters()
+        self._thickness = holes.thickness_of(
+            self.layout.surface(texels), self._opacity, self._data.subset(self._data.valid()),
+            scale=scale, aspect=self.layout.aspect, wrap=self.layout.wrap,
+        )  # fmt: skip
+
     def _keep_given(self) -> None:
+        _, texels = self.engine.parameters()
+        surface = self.layout.surface(texels)
         if self._given is not None:
-            _, texels = self.engine.parameters()
-            self.layout.surface(texels)[...] = self._given
+            surface[...] = self._given
+        if self._opacity is not None:
+            surface[...] = holes.with_holes(surface, self._opacity, self._thickness)
+            self.layout.cover(texels)[...] = self._opacity

@@ -80,6 +80,7 @@ def textures(layout: Layout) -> list[tuple[str, tuple[int, int], int]]:
     found = []
     if layout.heights:
         found.append(("texture.heights", layout.heights, 1))
+        found += [("texture.opacity", layout.heights, 1)] * layout.holes
     if layout.offset:
         found.append(("texture.offset", layout.offset[0].sizes[0], layout.offset[0].channels))
     for b, bank in enumerate(layout.banks):
@@ -96,4 +97,5 @@ def stored_as(spec: NeuMIPSpec, name: str) -> Precision:
 def _views(layout: Layout, texels: Array) -> list[Array]:
     """A view of each texture that `_textures` lists."""
     heights = [layout.surface(texels)[..., None]] if layout.heights else []
+    heights += [layout.cover(texels)[..., None]] if layout.holes else []
     return heights + [texture for levels in layout.textures(texels) for texture in levels]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, final
 
+from btfkit.conventions import CURVED_LOOKS
 from btfkit.footprint import level_sizes, resolved_level
 from btfkit.materials.base import Header
 from btfkit.native.neural.layout import Layout, Network, Networks, Output, Pyramid
@@ -30,6 +31,8 @@ class NeuMIPSpec:
         heights: whether the ray depth is where the view ray meets a texture of heights; then
             there is no offset network, whatever `offset` says.
         curved: whether curvature bends the rays through the heights.
+        holes: whether curved heights have an opacity.
+        looks: at most along a ray that may pass curved heights.
         frames: vectors among the pyramid's channels, three each, whose products with the half
             vector and the light the decoder takes too: 0, 1 or 2.
         hidden, offset_hidden: widths of the hidden layers.
@@ -64,6 +67,8 @@ class NeuMIPSpec:
     frames: int = 0
     networks: Networks = "float32"
     curved: bool = False
+    holes: bool = False
+    looks: int = CURVED_LOOKS
 
     def layout(self, header: Header) -> Layout:
         """The model as its kernels see it."""
@@ -105,4 +110,6 @@ class NeuMIPSpec:
             depth_scale=self.depth_scale,
             wrap=header.wrap == "wrap",
             curved=self.curved,
+            holes=self.holes,
+            looks=self.looks,
         )

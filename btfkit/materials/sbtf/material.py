@@ -31,6 +31,8 @@ class SBTF(NeuMIPMaterial):
     """NeuMIP with silhouettes, on planes and under curved surfaces.
 
     Attributes:
+        thickness: from the surface to the lowest height, tile widths; of a material with holes, to
+            its underside.
         sharpest: (concave, convex) curvature, 1/tile width, beyond which heights would reach the
             axis of curvature; infinite where none would. What bends more is answered as these,
             and a warning says so once.
@@ -48,6 +50,7 @@ class SBTF(NeuMIPMaterial):
         super().__init__(spec, weights, header)
         heights = self.layout.surface(self.texels) * spec.depth_scale
         top, bottom = max(float(heights.max()), 0.0), min(float(heights.min()), 0.0)
+        self.thickness = -bottom
         self.sharpest = (
             -MOST_BEND / top if top else -np.inf,
             MOST_BEND / -bottom if bottom else np.inf,

@@ -220,6 +220,8 @@ def _tables(layout: Layout, networks: Networks) -> dict[str, Any]:
         "banks": banks,
         "heights": heights,
         "curved": layout.curved,
+        "holes": layout.holes,
+        "looks": layout.looks,
         "offset": offset,
         "decoder": _network(layout.decoder),
     }

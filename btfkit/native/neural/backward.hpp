@@ -103,7 +103,13 @@ NEUMIP_TARGET inline void Tile::move_heights(int n, int valid, Gradient& g) {
         store(position[1] + i, load(in[kV] + i) + z * load(in[kRayV] + i));
         store(in[kSlope] + i, load(in[kSlope] + i) * load(in[kLift] + i));
         if (!bent) continue;
-        const I curved = load(in[kBend] + i) != all(0.f);
+        // At the rim of a hole a height moves nothing.
+        if (surface.opacity) {
+            const Corners c = surface.around(load(position[0] + i), load(position[1] + i));
+            const I whole = surface.read(surface.opacity, c) > all(kWhole);
+            store(in[kSlope] + i, select(whole, load(in[kSlope] + i), all(0.f)));
+        }
+        const I curved = follows(i);
         for (int row : {kRayU, kRayV}) {
             const F step = load(in[row] + i);
             store(in[row] + i, select(curved, -step, step));

@@ -103,9 +103,10 @@ FN F between(F gap, F under) {
 FN F meet_bent(const Surface& surface, const Ray& r, F u, F v, F du, F dv, I& opaque) {
     const F size_u = du < all(0.f) ? -du : du, size_v = dv < all(0.f) ? -dv : dv;
     const F length = r.stop - r.start;
+    const I sure = surface.opacity ? I{} : r.reaches;  // what it reaches may be a hole
     const F texels = larger(size_u * surface.w, size_v * surface.h) * length *
-                     select(r.reaches, all(1.f), all(kCurvedFiner));
-    const F looks = select(r.reaches, all(float(kLooks)), all(float(kCurvedLooks)));
+                     select(sure, all(1.f), all(kCurvedFiner));
+    const F looks = select(sure, all(float(kLooks)), all(float(surface.looks)));
     const F count = smaller(larger(-floor_of(-texels), all(1.f)), looks);
     const F step = length / count;
     // From look to look the angle turns by twice `half`.
@@ -123,10 +124,11 @@ FN F meet_bent(const Surface& surface, const Ray& r, F u, F v, F du, F dv, I& op
         cosine = r.cosine * cc - r.sine * ss;
     }
     F high = r.start, low = high;
-    F gap = drop / larger(sine, all(1e-9f)) - surface.at(u + high * du, v + high * dv);
+    F gap = surface.gap(drop / larger(sine, all(1e-9f)), u + high * du, v + high * dv);
     F under = gap;
     I going = ~I{};
-    for (int k = 1; k <= kCurvedLooks; ++k) {
+    const int most = surface.looks > kLooks ? surface.looks : kLooks;
+    for (int k = 1; k <= most; ++k) {
         high = select(going, low, high);
         gap = select(going, under, gap);
         drop -= fall * (cosine * c1 - sine * s1);
@@ -134,15 +136,15 @@ FN F meet_bent(const Surface& surface, const Ray& r, F u, F v, F du, F dv, I& op
         cosine = cosine * c2 - sine * s2;
         sine = turned;
         const F to = r.start + step * float(k);
-        const F rest = drop / larger(sine, all(1e-9f)) - surface.at(u + to * du, v + to * dv);
+        const F rest = surface.gap(drop / larger(sine, all(1e-9f)), u + to * du, v + to * dv);
         low = select(going, to, low);
         under = select(going, rest, under);
         going &= (rest > all(0.f)) & (float(k) < count);
         if (!any_of(going)) break;
     }
-    opaque = r.reaches | (under <= all(0.f));
+    opaque = sure | (under <= all(0.f));
     const F met = high + (low - high) * between(gap, under);
-    const F rest = r.height_at(met) - surface.at(u + met * du, v + met * dv);
+    const F rest = surface.gap(r.height_at(met), u + met * du, v + met * dv);
     const I above = rest > all(0.f);
     high = select(above, met, high);
     gap = select(above, rest, gap);

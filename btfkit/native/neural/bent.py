@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from btfkit.conventions import (
     CURVATURE_UNIT,
     CURVED_FINER,
-    CURVED_LOOKS,
     FLATTEST,
+    LEAST_RANGE,
     LOOKS,
     LOWEST_COSINE,
     MOST_BEND,
+    SLACK,
     STEEPEST,
     displacement,
 )
@@ -86,8 +87,8 @@ def meet(
     """Where view rays first meet heights on a curved surface.
 
     A ray that reaches the bottom is looked at a texel apart, or at LOOKS places where it is longer;
-    one that may leave again CURVED_FINER times as often, or at CURVED_LOOKS places. Between two
-    of them the surface is taken as straight, twice.
+    one that may leave again, or meet a hole, CURVED_FINER times as often, or at `found.looks`
+    places. Between two of them the surface is taken as straight, twice.
 
     Args:
         found: the heights. uv: (b, 2). view: (b, 3). curvature: (b,) 1/tile width.
@@ -95,29 +96,29 @@ def meet(
     heights = found.heights
     h, w = heights.shape
     rays = rays_of(found, view, curvature, aspect)
-    surface = heights[..., None]
+    # Where there are holes the ray may pass although it reaches the bottom.
+    sure = rays.reaches & (found.opacity is None)
 
     def above(way: Array) -> Array:
-        under = bilinear(surface, uv + way[:, None] * rays.along, wrap=wrap)[:, 0]
-        return height_at(rays, way) - under
+        return gap_over(found, uv + way[:, None] * rays.along, height_at(rays, way), wrap=wrap)
 
     def met(high: Array, low: Array, gap: Array, under: Array) -> Array:
         return high + (low - high) * np.clip(gap / np.maximum(gap - under, 1e-12), 0, 1)
 
     length = rays.stop - rays.start
     texels = length * np.max(np.abs(rays.along) * [w, h], axis=1)
-    texels = texels * np.where(rays.reaches, 1, CURVED_FINER)
-    count = np.clip(np.ceil(texels), 1, np.where(rays.reaches, LOOKS, CURVED_LOOKS))
+    texels = texels * np.where(sure, 1, CURVED_FINER)
+    count = np.clip(np.ceil(texels), 1, np.where(sure, LOOKS, found.looks))
     low = high = rays.start
     under = gap = above(low)
     going = np.ones(len(uv), bool)
-    for k in range(1, CURVED_LOOKS + 1):
+    for k in range(1, max(found.looks, LOOKS) + 1):
         high, gap = np.where(going, low, high), np.where(going, under, gap)
         to = rays.start + length * np.minimum(k / count, 1).astype(length.dtype)
         rest = above(to)
         low, under = np.where(going, to, low), np.where(going, rest, under)
         going &= (rest > 0) & (k < count)
-    opaque = rays.reaches | (under <= 0)
+    opaque = sure | (under <= 0)
     first = met(high, low, gap, under)
     rest = above(first)
     short = rest > 0
@@ -127,6 +128,22 @@ def meet(
     way = np.where(opaque, way, rays.stop)
     depth = -way * rays.share * np.asarray(found.scale, way.dtype)
     return Crossing(depth, opaque.astype(way.dtype), way, rays.bend * way)
+
+
+def gap_over(found: Heights, uv: Array, height: Array, *, wrap: bool) -> Array:
+    """How far (b,) heights at uv (b, 2) lie above what there is; in holes there is nothing."""
+    gap = height - bilinear(found.heights[..., None], uv, wrap=wrap)[:, 0]
+    if found.opacity is None:
+        return gap
+    rise = gap.dtype.type(hole_range(found))
+    hole = gap.dtype.type(0.5) - bilinear(found.opacity[..., None], uv, wrap=wrap)[:, 0]
+    return np.maximum(gap - gap.dtype.type(SLACK) * rise, hole * rise)
+
+
+def hole_range(found: Heights) -> float:
+    """Between the surface, or what stands above it, and the underside, units; never 0."""
+    reach = max(float(found.heights.max()), 0.0) - min(float(found.heights.min()), 0.0)
+    return max(reach, LEAST_RANGE)
 
 
 def rays_of(found: Heights, view: Array, curvature: Array, aspect: float) -> Rays:

@@ -3,7 +3,8 @@
 A model is two flat float32 arrays. `weights` holds the networks, layer by layer: (out, in)
 row-major, then the (out,) biases; the offset network first. `texels` (t, 8) holds all textures
 one after the other, row-major; a texture uses the first of the eight numbers of a texel. Heights
-lie before all textures, eight of them in the room of one texel.
+lie before all textures, eight of them in the room of one texel, and after them in the same way
+the opacity of heights that have holes.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any, Literal, final
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.conventions import CURVED_LOOKS
 from btfkit.program import (
     Activation,
     Dense,
@@ -104,6 +106,8 @@ class Layout:
         heights: (h, w) of a texture of heights, whose first crossing with the view ray gives the
             ray depth in place of the network; None without it.
         curved: whether curvature bends the rays through the heights, which may then pass them.
+        holes: whether curved heights have an opacity, as `program.Heights` has it.
+        looks: at most along a ray that may pass the heights.
         frames: vectors among the first bank's features, three numbers each: the decoder takes
             the products of each with the half vector and with the light, after the features.
         channels: of the answer. output: "log" as it comes, "relu" with negative numbers cut,
@@ -124,12 +128,18 @@ class Layout:
     depth_scale: float = 1.0
     wrap: bool = True
     curved: bool = False
+    holes: bool = False
+    looks: int = CURVED_LOOKS
 
     def __post_init__(self) -> None:
         if self.offset and self.heights:
             raise ValueError("a ray depth comes from a network or from heights, not from both")
         if self.curved and not self.heights:
             raise ValueError("curvature bends rays through heights; there are none")
+        if self.looks < 1:
+            raise ValueError(f"looks = {self.looks}; expected 1 or more")
+        if self.holes and not self.curved:
+            raise ValueError("holes are those of curved heights; there are none")
         if "curvature" in self.decoder.directions and not self.curved:
             raise ValueError("the input curvature is that of curved heights; there are none")
 
@@ -152,6 +162,10 @@ class Layout:
 
     @property
     def _rows_of_heights(self) -> int:
+        return self._rows_of_plane * (1 + self.holes)
+
+    @property
+    def _rows_of_plane(self) -> int:
         return -(-self.heights[0] * self.heights[1] // CHANNELS) if self.heights else 0
 
     @property
@@ -183,7 +197,15 @@ class Layout:
         """(h, w) view of the heights, units of depth_scale."""
         assert self.heights is not None
         h, w = self.heights
-        return texels[: self._rows_of_heights].reshape(-1)[: h * w].reshape(h, w)
+        return texels[: self._rows_of_plane].reshape(-1)[: h * w].reshape(h, w)
+
+    def cover(self, texels: Any) -> Any:
+        """(h, w) view of the heights' opacity; None where they have no holes."""
+        if not self.holes or self.heights is None:
+            return None
+        h, w = self.heights
+        plane = texels[self._rows_of_plane : self._rows_of_heights]
+        return plane.reshape(-1)[: h * w].reshape(h, w)
 
     def program(
         self,
@@ -209,7 +231,9 @@ class Layout:
         levels = self.textures(texels)
         depth: Heights | DepthNetwork | None = None
         if self.heights:
-            depth = Heights(self.surface(texels), self.depth_scale, self.curved)
+            depth = Heights(
+                self.surface(texels), self.depth_scale, self.curved, self.cover(texels), self.looks
+            )
         if self.offset:
             pyramid, network = self.offset
             texture = _texture("offset", pyramid, levels.pop(0))

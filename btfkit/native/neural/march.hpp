@@ -40,18 +40,29 @@ struct Surface {
     const float* heights;
     float w, h, top, bottom;
     bool wrap;
+    const float* opacity;  // of the heights, or null
+    int looks;             // at most along a ray that may pass
 
     MEMBER Corners around(F u, F v) const {
         return corners_of(u, v, all(w), all(h), I{}, wrap);
     }
-    MEMBER F at(F u, F v) const {
+    MEMBER F at(F u, F v) const { return read(heights, around(u, v)); }
+    // How far a height z lies above what there is; in holes there is nothing.
+    MEMBER F gap(F z, F u, F v) const {
         const Corners c = around(u, v);
+        const F above = z - read(heights, c);
+        if (!opacity) return above;
+        const float range = (top > 0.f ? top : 0.f) - (bottom < 0.f ? bottom : 0.f);
+        const float rise = range > kLeastRange ? range : kLeastRange;
+        return larger(above - kSlack * rise, (0.5f - read(opacity, c)) * rise);
+    }
+    MEMBER F read(const float* from, const Corners& c) const {
         F h[4];
         if (!any_of(c.at[1] != c.at[0] + 1)) {
-            gathered_pair(heights, c.at[0], h[0], h[1]);
-            gathered_pair(heights, c.at[2], h[2], h[3]);
+            gathered_pair(from, c.at[0], h[0], h[1]);
+            gathered_pair(from, c.at[2], h[2], h[3]);
         } else {  // a lane at the border of the tile
-            for (int j = 0; j < 4; ++j) h[j] = gathered(heights, c.at[j]);
+            for (int j = 0; j < 4; ++j) h[j] = gathered(from, c.at[j]);
         }
         const F upper = h[0] + (h[1] - h[0]) * c.fx;
         const F lower = h[2] + (h[3] - h[2]) * c.fx;

@@ -144,6 +144,8 @@ class Model {
         p.channels = nb::cast<int>(tables["channels"]);
         p.frames = nb::cast<int>(tables["frames"]);
         p.curved = nb::cast<bool>(tables["curved"]);
+        p.holes = nb::cast<bool>(tables["holes"]);
+        p.looks = nb::cast<int>(tables["looks"]);
         p.half = nb::cast<bool>(tables["rounded"]);
         p.pairs = multiplies_pairs();
         for (nb::handle t : tables["textures"])

@@ -136,6 +136,10 @@ def marched(
         return np.zeros(len(uv), dtype), opacity, turn
     if isinstance(found, DepthNetwork):
         return _looked_up(program, found, uv, view, None)[:, 0] * found.scale, opacity, turn
+    if found.opacity is not None:
+        bend = np.zeros(len(uv), dtype) if curvature is None else curvature
+        end = bent.meet(found, uv, view, bend, aspect=program.aspect, wrap=program.wrap)
+        return end.depth, end.opacity, end.turn
     along = ray(view, program.aspect, found.scale)
     met = crossing(found.heights, uv, along, wrap=program.wrap)
     depth = met * lift(view) * found.scale

@@ -62,6 +62,8 @@ struct Mlp {
 struct Plan {
     bool wrap = true, offset = false;
     bool curved = false;  // whether curvature bends rays through heights, which may pass them
+    int looks = 1;        // at most along a ray that may pass
+    bool holes = false;   // whether curved heights have an opacity, a float a texel behind them
     float aspect = 1, depth_scale = 1;
     int output = kLog, channels = 3;
     int frames = 0;  // vectors among the first features: the decoder takes their products with
@@ -74,9 +76,11 @@ struct Plan {
     std::vector<Bank> banks;
     Mlp offset_mlp, decoder;
 
+    // Texels that hold one float for each height.
+    int64_t plane() const { return (int64_t(heights.h) * heights.w + kChannels - 1) / kChannels; }
     size_t weights() const { return (offset ? offset_mlp.size() : 0) + decoder.size(); }
     int64_t texels() const {
-        int64_t n = (int64_t(heights.h) * heights.w + kChannels - 1) / kChannels;
+        int64_t n = plane() * (1 + holes);
         for (const auto& t : textures) n = std::max(n, t.start + int64_t(t.h) * t.w);
         return n;
     }
@@ -120,6 +124,8 @@ inline void check(const Plan& plan) {
     require(!(plan.offset && plan.heights.h), "depths from a network or from heights, not both");
     require(int64_t(plan.heights.h) * plan.heights.w < (int64_t(1) << 30), "2^30 heights or more");
     require(!plan.curved || plan.heights.h > 0, "curvature bends rays through heights alone");
+    require(plan.looks >= 1, "a ray is looked at once at least");
+    require(!plan.holes || plan.curved, "holes are those of curved heights");
     auto takes_curvature = [](const Mlp& m) {
         return std::count(m.directions.begin(), m.directions.end(), int(kCurvature)) > 0;
     };

@@ -29,7 +29,8 @@ struct Tile {
     NEUMIP_TARGET Tile(const Plan& p, const float* weights, const float* t, const Batch& b,
                        bool train)
         : plan(p), texels(t), train_(train) {
-        surface = {t, float(p.heights.w), float(p.heights.h), b.top, b.bottom, p.wrap};
+        surface = {t, float(p.heights.w), float(p.heights.h), b.top, b.bottom, p.wrap,
+                   p.holes ? t + p.plane() * kChannels : nullptr, p.looks};
         decoder.pack(p.decoder, weights, train, p.half, p.pairs && L == 16);
         decoder_trace.reset(p.decoder, train);
         if (p.offset) {
@@ -108,10 +109,12 @@ struct Tile {
 
     NEUMIP_TARGET void set_curvature(const float* curvature, int valid, int n) {
         if (!plan.curved) return;
-        bent = curvature != nullptr;
+        // Rays that may pass a hole are followed as those that may pass an outline.
+        bent = curvature != nullptr || plan.holes;
         std::fill(in[kOpaque], in[kOpaque] + n, 1.f);
-        if (!bent) {
+        if (curvature == nullptr) {
             std::memset(direction[kCurvature], 0, sizeof direction[kCurvature]);
+            std::fill(in[kBend], in[kBend] + n, 0.f);
             return;
         }
         for (int i = 0; i < n; ++i) in[kBend][i] = curvature[i < valid ? i : valid - 1];
@@ -122,10 +125,16 @@ struct Tile {
         }
     }
 
+    // Which of L queries have rays that may pass.
+    MEMBER I follows(int i) {
+        if (plan.holes) return ~I{};
+        return bent ? load(in[kBend] + i) != all(0.f) : I{};
+    }
+
     // Ray depths where the view rays of queries from..from+n meet the heights.
     MEMBER void meet(int from, int n) {
         for (int i = from; i < from + n; i += L) {
-            const I curved = bent ? load(in[kBend] + i) != all(0.f) : I{};
+            const I curved = follows(i);
             if (any_of(~curved)) {
                 const F z = surface.crossing(load(in[kU] + i), load(in[kV] + i),
                                              load(in[kRayU] + i), load(in[kRayV] + i));

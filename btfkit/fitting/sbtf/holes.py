@@ -1,0 +1,100 @@
+"""Holes of a material that is seen through: where they are, and how thick it is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from btfkit import metrics
+from btfkit.native.neural import bent
+from btfkit.native.neural.layout import Array
+from btfkit.native.neural.lookup import bilinear
+from btfkit.program import Heights
+from btfkit.queries import QuerySet
+
+# Views from which the place that is looked at is all but the place that is asked for; rows that
+# thicknesses are told apart by, those of views below; how many are tried, and the largest, units.
+_STEEP, _FLAT, _ROWS = 0.9, 0.8, 8192
+_TRIED, _THICKEST = 12, 4.0
+# Share of rays over the plane that pass where a material is seen through.
+_FEW = 1e-3
+
+
+def seen_through(queries: QuerySet) -> bool:
+    """Whether rays pass where no curvature lets them."""
+    if queries.opacity is None:
+        return False
+    flat = queries.opacity if queries.curvature is None else queries.opacity[queries.curvature == 0]
+    return bool(len(flat)) and float((flat < 0.5).mean()) > _FEW
+
+
+def opacity_of(queries: QuerySet, size: tuple[int, int], *, wrap: bool) -> Array:
+    """(h, w) share of upright rays that each texel stops.
+
+    Texels that no such ray reaches take what lies around them.
+
+    Args:
+        queries: valid rows, with opacity.
+    """
+    assert queries.opacity is not None
+    rows = np.flatnonzero(queries.view[:, 2] > _STEEP)
+    if not len(rows):
+        rows = np.argsort(-queries.view[:, 2])[: max(len(queries) // 10, 1)]
+    h, w = size
+    place = queries.uv[rows] - np.floor(queries.uv[rows]) if wrap else queries.uv[rows].clip(0, 1)
+    col, row = (np.floor(place * [w, h]).astype(int) % [w, h]).T
+    stopped, count = np.zeros(size), np.zeros(size)
+    np.add.at(stopped, (row, col), queries.opacity[rows])
+    np.add.at(count, (row, col), 1)
+    mode = "wrap" if wrap else "nearest"
+    around = [gaussian_filter(part, 1.0, mode=mode) for part in (stopped, count)]
+    likely = around[0] / np.maximum(around[1], 1e-9)
+    return ((stopped + likely) / (count + 1)).astype(np.float32)
+
+
+def with_holes(surface: Array, opacity: Array, thickness: float) -> Array:
+    """Heights (h, w) whose holes reach the underside, and no others do."""
+    return np.where(opacity < 0.5, -thickness, np.maximum(surface, -thickness)).astype(np.float32)
+
+
+def thickness_of(
+    surface: Array, opacity: Array, queries: QuerySet, *, scale: float, aspect: float, wrap: bool
+) -> float:
+    """The thickness, units of the heights, under which most rays do what they are known to do.
+
+    Args:
+        surface: (h, w) heights; those in holes do not count. opacity: (h, w).
+        queries: valid rows, with opacity. scale: tile widths a unit.
+    """
+    assert queries.opacity is not None
+    solid = surface[opacity >= 0.5]
+    depth = max(-float(np.percentile(solid, 1)) if solid.size else 0.0, 1e-3)
+    rows = np.flatnonzero(queries.view[:, 2] < _FLAT)
+    rows = np.random.default_rng(5).permutation(rows)[:_ROWS]
+    bend = np.zeros(len(rows), np.float32)
+    if queries.curvature is not None:
+        bend = queries.curvature[rows]
+    truth = queries.opacity[rows].astype(np.float32)
+    best, found = -1.0, depth
+    for thickness in np.geomspace(depth, max(_THICKEST, 2 * depth), _TRIED):
+        heights = Heights(with_holes(surface, opacity, thickness), scale, True, opacity)
+        met = bent.meet(heights, queries.uv[rows], queries.view[rows], bend,
+                        aspect=aspect, wrap=wrap)  # fmt: skip
+        agree = metrics.iou(met.opacity, truth) + metrics.iou(1 - met.opacity, 1 - truth)
+        if agree > best:
+            best, found = agree, float(thickness)
+    return found
+
+
+def solid_at(opacity: Array, uv: Array, *, wrap: bool) -> NDArray[np.bool_]:
+    """(b,) whether there is no hole at uv (b, 2)."""
+    return np.asarray(bilinear(opacity[..., None], uv, wrap=wrap)[:, 0] >= 0.5)
+
+
+def resized(plane: NDArray[np.float32], size: tuple[int, int], *, wrap: bool) -> Array:
+    """(h, w) of another plane, read at the centres of its texels."""
+    h, w = size
+    u, v = np.meshgrid((np.arange(w) + 0.5) / w, (np.arange(h) + 0.5) / h)
+    at = np.stack([u, v], axis=-1).reshape(-1, 2)
+    return bilinear(plane[..., None], at, wrap=wrap).reshape(h, w).astype(np.float32)
