@@ -40,17 +40,21 @@ def textures(program: Program) -> Iterator[Texture]:
         yield program.depth.texture
 
 
-def refuse_unknown(program: Program) -> None:
-    """TypeError for what no exporter knows how to write."""
+# Targets that follow rays which curvature bends.
+BENT = ("npz", "cpp")
+
+
+def refuse_unknown(program: Program, target: str = "") -> None:
+    """TypeError for what an exporter does not know how to write."""
     if program.cover is not None or isinstance(program.depth, OffsetNetwork):
         raise TypeError(
             "this material has networks of opacity and offset of its own, which no export has; "
             "expected one whose rays end at heights or by a network of depth"
         )
-    if isinstance(program.depth, Heights) and program.depth.curved:
+    if isinstance(program.depth, Heights) and program.depth.curved and target not in BENT:
         raise TypeError(
-            "the view ray of this material bends with curvature, which no export has; "
-            "expected one whose heights lie on the plane"
+            f"the view ray of this material bends with curvature, which {target or 'a page'} does "
+            f"not follow; {', '.join(BENT)} do"
         )
 
 

@@ -10,18 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.conventions import (
+    CURVATURE_UNIT,
+    CURVED_FINER,
     EPSILON,
     LEAK,
     LEVELS_UNIT,
     LOOKS,
     LOWEST_COSINE,
+    LOWEST_SEEN,
+    MOST_BEND,
     MOST_LOG,
+    SLACK,
     STEEPEST,
 )
 from btfkit.export.arrays import narrowed
 from btfkit.export.numbers import literal
 from btfkit.export.sections import filled, sections
 from btfkit.materials.base import Material
+from btfkit.native.neural import bent
 from btfkit.native.neural.plain import YUV_TO_RGB
 from btfkit.program import Dense, DepthNetwork, Heights, Program, Texture
 
@@ -36,7 +42,7 @@ _INPUTS = {
        for k, axis in enumerate("xy")},
     "cos_diff": "cos_diff",
     "level": f"level / {LEVELS_UNIT}",
-    "curvature": "0.0f",
+    "curvature": f"curvature / (std::fabs(curvature) + {CURVATURE_UNIT}f)",
 }  # fmt: skip
 
 
@@ -46,7 +52,7 @@ def write(material: Material, program: Program, folder: Path) -> None:
     (folder / "material.hpp").write_text(header)
     (folder / "material.bin").write_bytes(numbers)
     example = sections("material.hpp.txt")["example"]
-    (folder / "example.cpp").write_text(filled(example, space=SPACE))
+    (folder / "example.cpp").write_text(filled(example, space=SPACE, **_curvature(program)))
 
 
 def source(program: Program, *, model: str, texel_mm: float | None = None) -> tuple[str, bytes]:
@@ -65,7 +71,8 @@ def source(program: Program, *, model: str, texel_mm: float | None = None) -> tu
         else "float(std::clamp(u, 0.0, 1.0)), float(std::clamp(v, 0.0, 1.0))",
         "steepest": _number(STEEPEST), "lowest": _number(LOWEST_COSINE), "looks": LOOKS,
         "epsilon": _number(EPSILON),
-        "scale": _number(program.depth.scale) if program.depth else "0.0f",
+        "scale": _number(program.depth.scale) if _scaled(program) else "0.0f",
+        **_curvature(program),
     }  # fmt: skip
     parts = sections("material.hpp.txt")
     chosen = _chosen(program)
@@ -121,8 +128,9 @@ class _Store:
         ]
         for name, levels in self._named:
             places = [f"{{{at[id(x)]}, {x.shape[0]}, {x.shape[1]}}}" for x in levels]
-            brackets = "" if name == "kHeights" else "[]"
-            listed = places[0] if name == "kHeights" else "{" + ", ".join(places) + "}"
+            single = name in ("kHeights", "kOpacity")
+            brackets = "" if single else "[]"
+            listed = places[0] if single else "{" + ", ".join(places) + "}"
             lines.append(f"static constexpr Level {name}{brackets} = {listed};")
         if isinstance(program.depth, Heights):
             heights = program.depth.heights
@@ -144,6 +152,34 @@ def fnv(data: bytes) -> int:
     return found
 
 
+def _scaled(program: Program) -> bool:
+    return isinstance(program.depth, (Heights, DepthNetwork))
+
+
+def _curvature(program: Program) -> dict[str, object]:
+    """What a header says of curvature: nothing where rays are straight."""
+    found = program.depth
+    if not (isinstance(found, Heights) and found.curved):
+        return {**dict.fromkeys(("more", "given", "bad", "tenth"), ""), "columns": 9}
+    low, high = bent.sharpest(found)
+    most = "std::numeric_limits<float>::infinity()"
+    reach = _number(bent.hole_range(found))
+    hole = (
+        "    float solid = 0;\n    lookup<1>(kOpacity, u, v, 1, &solid);\n"
+        f"    height += {_number(SLACK)} * {reach};\n"
+        f"    return std::max(z - height, (0.5f - solid) * {reach});\n  }}\n"
+    )
+    return {
+        "more": ", curvature", "given": ", float curvature = 0",
+        "bad": " || !std::isfinite(curvature)", "tenth": ", row[9]", "columns": 10,
+        "flattest": _number(low) if np.isfinite(low) else f"-{most}",
+        "sharpest": _number(high) if np.isfinite(high) else most,
+        "seen": _number(LOWEST_SEEN), "bend": _number(MOST_BEND), "finer": _number(CURVED_FINER),
+        "more_looks": found.looks, "holes": "false" if found.opacity is None else "true",
+        "hole": "    return z - height;\n  }\n" if found.opacity is None else hole,
+    }  # fmt: skip
+
+
 def _number(value: Any) -> str:
     return literal(value) + "f"
 
@@ -160,12 +196,15 @@ def _chosen(program: Program) -> tuple[list[str], list[str]]:
     disc = any(name.endswith("_disc") for name in inputs)
     marched = isinstance(depth, Heights)
     before = ["level" if program.leveled else "no_level"]
-    before += ["half"] * bool(half) + ["disc"] * disc + ["march_depth"] * marched
-    before += ["steps"] * (depth is not None)
+    curved = isinstance(depth, Heights) and depth.curved
+    before += ["bent_depth"] * curved + ["half"] * bool(half) + ["disc"] * disc
+    if not curved:
+        before += ["march_depth"] * marched + ["steps"] * (depth is not None)
     after = ["beside_wrap" if program.wrap else "beside_clamp", "pyramid"]
     after += ["dense"] * bool(layers) + ["normal"] * any(x.gain is not None for x in layers)
     after += ["rounded"] * program.rounded + ["sigmoid"] * bool(kinds & {"mask", "opacity"})
     after += ["on_disc"] * disc + ["step"] * (depth is not None) + ["crossing"] * marched
+    after += ["bent"] * curved
     return before, after
 
 
@@ -173,6 +212,8 @@ def _depth(program: Program, store: _Store) -> list[str]:
     found = program.depth
     if isinstance(found, Heights):
         store.levels("kHeights", (found.heights,))
+        if found.opacity is not None:
+            store.levels("kOpacity", (found.opacity,))
     if not isinstance(found, DepthNetwork):
         return []
     place = store.levels("kDepth", (found.texture.levels[0],))

@@ -8,17 +8,23 @@ from pathlib import Path
 import numpy as np
 
 from btfkit.conventions import (
+    CURVATURE_UNIT,
+    CURVED_FINER,
     EPSILON,
     LEAK,
     LEVELS_UNIT,
     LOOKS,
     LOWEST_COSINE,
+    LOWEST_SEEN,
+    MOST_BEND,
     MOST_LOG,
+    SLACK,
     STEEPEST,
 )
 from btfkit.export.arrays import named
 from btfkit.export.sections import filled, sections
 from btfkit.materials.base import Material
+from btfkit.native.neural import bent
 from btfkit.native.neural.plain import YUV_TO_RGB
 from btfkit.program import Heights, Program
 
@@ -39,23 +45,50 @@ def reader(program: Program, model: str, *, arrays: str = "npz") -> str:
     """
     parts = sections("numpy.py.txt")
     wanted = ["start", f"arrays_{arrays}", "activations", "lookup", "run"]
+    curved = isinstance(program.depth, Heights) and program.depth.curved
     if isinstance(program.depth, Heights):
-        wanted.append("march")
-    wanted.append("known")
+        wanted += ["march"] + ["march_bent"] * curved
+    wanted += ["known"] + ["bent_depth"] * curved + ["half"]
     if any(name.endswith("_disc") for name in program.inputs):
         wanted.append("disc")
-    if program.depth is not None:
+    if program.depth is not None and not curved:
         wanted.append("march_depth" if isinstance(program.depth, Heights) else "network_depth")
-    wanted += ["textures_moved" if program.depth is not None else "textures"]
+    moved = "textures_bent" if curved else "textures_moved"
+    wanted += [moved if program.depth is not None else "textures"]
     wanted += ["frames"] * bool(program.frames) + ["layers"]
     wanted += ["scaling"] * (program.scaling is not None)
     wanted += [f"output_{program.output}"]
     if program.output in ("log", "relu"):
         wanted += ["mask"] * any(head.kind == "mask" for head in program.heads) + ["expm1"]
-    wanted += ["opacity" if program.opacity == "head" else "opaque", "end"]
+    last = {"head": "opacity", "march": "passed"}.get(program.opacity, "opaque")
+    wanted += [last, "end"]
     return filled(
         "".join(parts[name] for name in wanted),
         model=model, leak=LEAK, lowest=LOWEST_COSINE, looks=LOOKS, steepest=STEEPEST,
         most=MOST_LOG, unit=LEVELS_UNIT, epsilon=EPSILON, yuv=YUV_TO_RGB.tolist(),
         below="True" if program.full_sphere else "light[:, 2] > 0",
+        **_curvature(program),
     )  # fmt: skip
+
+
+def _curvature(program: Program) -> dict[str, object]:
+    """What a reader says of curvature: nothing where rays are straight."""
+    if not (isinstance(program.depth, Heights) and program.depth.curved):
+        names = ("more", "given", "flat", "safe", "filed")
+        return {**dict.fromkeys(names, ""), "told": "0 * level"}
+    low, high = bent.sharpest(program.depth)
+    return {
+        "more": ", curvature",
+        "given": ", curvature=None",
+        "flat": "    curvature = np.zeros(len(uv)) if curvature is None else curvature\n",
+        "safe": ", (curvature, 0)",
+        "filed": ', Q["curvature"] if "curvature" in Q else None',
+        "told": f"curvature / ({CURVATURE_UNIT} + np.abs(curvature))",
+        "flattest": f"{low!r}" if np.isfinite(low) else "-np.inf",
+        "sharpest": f"{high!r}" if np.isfinite(high) else "np.inf",
+        "slack": SLACK,
+        "range": repr(bent.hole_range(program.depth)),
+        "bend": MOST_BEND,
+        "finer": CURVED_FINER,
+        "seen": LOWEST_SEEN,
+    }

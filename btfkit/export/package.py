@@ -45,7 +45,7 @@ def export(
         raise ValueError(f"no target {target!r}; there are {', '.join(TARGETS)}")
     program = material.program()
     if target not in ASKED:
-        refuse_unknown(program)
+        refuse_unknown(program, target)
     module, function = TARGETS[target].split(":")
     write: Callable[[Material, Program, Path], None]
     write = getattr(importlib.import_module(module), function)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,6 +13,7 @@ from btfkit.materials.neubtf.paper import NeuBTFPaper, NeuBTFSpec
 from btfkit.materials.neumip.material import NeuMIP, NeuMIPPaper
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.materials.rainer import Rainer20, RainerSpec
+from btfkit.materials.sbtf.material import SBTF
 
 GRID = (24, 36)
 NEUMIP = NeuMIPSpec(
@@ -28,12 +30,25 @@ SPECS = {
     "neubtf-paper": (NeuBTFPaper, NeuBTFSpec((16, 24), omega=1.25, parallax=True), "wrap"),
     "rainer20": (Rainer20, RainerSpec((8, 12), latents=32, whitened=True), "clamp"),
 }
+# Those whose rays curvature bends, which only some exports follow.
+BENT = {
+    "sbtf": (
+        SBTF,
+        replace(NEUMIP, curved=True, directions=(*NEUMIP.directions, "curvature")),
+        "wrap",
+    ),
+    "sbtf with holes": (
+        SBTF,
+        NeuMIPSpec(GRID, levels=1, heights=True, curved=True, holes=True, looks=24),
+        "clamp",
+    ),
+}
 
 
 @cache
 def made(name: str, *, seed: int = 0) -> Material:
     """The material of a case, its numbers random and such that answers are between 0 and 10."""
-    kind, spec, wrap = SPECS[name]
+    kind, spec, wrap = {**SPECS, **BENT}[name]
     header = Header(grid=GRID, wrap=wrap, texel_mm=0.25, licence="CC0-1.0")
     rng = np.random.default_rng(seed)
     weights = {}

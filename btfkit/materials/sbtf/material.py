@@ -18,11 +18,11 @@ from typing import Any, ClassVar, final
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.conventions import MOST_BEND
 from btfkit.materials.base import Array, Header
 from btfkit.materials.neumip.material import NeuMIPMaterial
 from btfkit.materials.neumip.spec import NeuMIPSpec
-from btfkit.native.neural import plain
+from btfkit.native.neural import bent, plain
+from btfkit.program import Heights
 from btfkit.queries import Query
 
 
@@ -48,13 +48,10 @@ class SBTF(NeuMIPMaterial):
                 f"heights = {spec.heights}, curved = {spec.curved}; an sbtf has curved heights"
             )
         super().__init__(spec, weights, header)
-        heights = self.layout.surface(self.texels) * spec.depth_scale
-        top, bottom = max(float(heights.max()), 0.0), min(float(heights.min()), 0.0)
-        self.thickness = -bottom
-        self.sharpest = (
-            -MOST_BEND / top if top else -np.inf,
-            MOST_BEND / -bottom if bottom else np.inf,
-        )
+        found = self._program.depth
+        assert isinstance(found, Heights)
+        self.thickness = max(-float(found.heights.min()), 0.0) * found.scale
+        self.sharpest = bent.sharpest(found)
 
     def _answer(self, query: Query) -> tuple[Array, Array | None]:
         bend, footprint = self._bend(query), self._footprint(query)

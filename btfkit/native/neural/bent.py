@@ -146,6 +146,13 @@ def hole_range(found: Heights) -> float:
     return max(reach, LEAST_RANGE)
 
 
+def sharpest(found: Heights) -> tuple[float, float]:
+    """Curvatures (concave, convex), 1/tile width, beyond which heights would reach the axis."""
+    top = max(float(found.heights.max()), 0.0) * found.scale
+    bottom = min(float(found.heights.min()), 0.0) * found.scale
+    return -MOST_BEND / top if top else -np.inf, MOST_BEND / -bottom if bottom else np.inf
+
+
 def rays_of(found: Heights, view: Array, curvature: Array, aspect: float) -> Rays:
     """The rays of some views (b, 3) under curvatures (b,), 1/tile width."""
     top, bottom = max(float(found.heights.max()), 0.0), min(float(found.heights.min()), 0.0)

@@ -1,0 +1,115 @@
+"""Exports that follow bent rays answer as the material does, each run by its own example."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cases import BENT, directions, made
+
+from btfkit.export import TARGETS
+from btfkit.export.arrays import BENT as FOLLOW
+from btfkit.export.package import ASKED, export
+from btfkit.materials.base import Material
+from btfkit.native.neural import plain
+from btfkit.queries import Response
+
+COMPILER = shutil.which("g++") or shutil.which("c++")
+every_case = pytest.mark.parametrize("name", list(BENT))
+Asked = dict[str, np.ndarray]
+
+
+def asked(count: int = 1500) -> Asked:
+    rng = np.random.default_rng(4)
+    light, view = directions(rng, count), directions(rng, count)
+    light[:400, 2] *= -1
+    view[400:420] = [0, 0, 1]
+    size = np.exp(rng.uniform(np.log(0.5), np.log(200), count))
+    curvature = (rng.choice([1, 1, -1, 0], count) * size).astype(np.float32)
+    curvature[420:425] = np.nan, np.inf, -np.inf, 1e30, -1e30
+    view[430:440, 2] = -0.5
+    return {
+        "uv": rng.uniform(-2, 3, (count, 2)).astype(np.float32), "light": light, "view": view,
+        "footprint": rng.choice([0.5, 1.3, 7], count).astype(np.float32), "curvature": curvature,
+    }  # fmt: skip
+
+
+def wanted(material: Material, queries: Asked) -> Response:
+    with warnings.catch_warnings():
+        # Counts of what is masked, and of curvature that no surface has.
+        warnings.simplefilter("ignore", UserWarning)
+        return material.evaluate(**queries)
+
+
+def settled(material: Material, queries: Asked) -> np.ndarray:
+    """Rows whose rays end at one place, however their numbers are rounded."""
+    ends = []
+    reduced = queries["uv"] - np.floor(queries["uv"])
+    uv = reduced if material.header.wrap == "wrap" else queries["uv"].clip(0, 1)
+    low, high = material.sharpest  # type: ignore[attr-defined]
+    for kind in (np.float32, np.float64):
+        program = material.program().in_dtype(kind)
+        view = queries["view"].astype(kind)
+        view /= np.linalg.norm(view, axis=1, keepdims=True)
+        bend = np.nan_to_num(queries["curvature"]).clip(low, high).astype(kind)
+        ends.append(plain.marched(program, uv.astype(kind), view, bend))
+    (one, first, _), (other, second, _) = ends
+    return (np.abs(one - other) < 1e-6) & (first == second)
+
+
+def agree(rgb: np.ndarray, opacity: np.ndarray, response: Response, rows: np.ndarray) -> None:
+    assert np.isfinite(rgb).all()
+    assert rows.mean() > 0.9
+    np.testing.assert_allclose(opacity[rows], response.opacity[rows], atol=1e-6)
+    # A place that is off by 1e-6 of a tile, in textures of random texels.
+    limit = 3e-4 * np.maximum(1, np.abs(response.reflectance))
+    assert (np.abs(rgb - response.reflectance) <= limit)[rows].all()
+    masked = slice(420, 423), slice(430, 440)
+    assert not any(opacity[part].any() or rgb[part].any() for part in masked)
+    assert 0.02 < (opacity[rows] == 0).mean() < 0.7
+    assert (rgb[:400] > 0).any()
+
+
+@every_case
+def test_the_reader_in_numpy_follows_bent_rays(name: str, tmp_path: Path) -> None:
+    material, queries = made(name), asked()
+    export(material, "npz", tmp_path / "out")
+    np.savez(tmp_path / "q.npz", **queries)  # type: ignore[arg-type]
+    command = [sys.executable, tmp_path / "out" / "evaluate.py", tmp_path / "q.npz"]
+    subprocess.run([*command, tmp_path / "a.npz"], check=True)
+    with np.load(tmp_path / "a.npz") as answers:
+        rows = settled(material, queries)
+        agree(answers["rgb"], answers["opacity"], wanted(material, queries), rows)
+    del queries["curvature"]
+    np.savez(tmp_path / "q.npz", **queries)  # type: ignore[arg-type]
+    subprocess.run([*command, tmp_path / "a.npz"], check=True)
+    with np.load(tmp_path / "a.npz") as answers:
+        flat = np.abs(answers["rgb"] - wanted(material, queries).reflectance)
+    assert np.median(flat) < 1e-5
+
+
+@every_case
+@pytest.mark.slow
+@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler: apt-get install g++")
+def test_the_header_follows_bent_rays(name: str, tmp_path: Path) -> None:
+    material, queries, out = made(name), asked(), tmp_path / "out"
+    export(material, "cpp", out)
+    flags = ["-O1", "-std=c++17", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run([COMPILER, *flags, "example.cpp", "-o", "example"], cwd=out, check=True)
+    np.column_stack(list(queries.values())).astype("<f4").tofile(out / "q.bin")
+    subprocess.run(["./example", "q.bin", "a.bin"], cwd=out, check=True)
+    answers = np.fromfile(out / "a.bin", "<f4").reshape(len(queries["uv"]), -1)
+    rows = settled(material, queries)
+    agree(answers[:, :-1], answers[:, -1], wanted(material, queries), rows)
+
+
+@pytest.mark.parametrize("target", sorted(set(TARGETS) - {*ASKED, *FOLLOW}))
+def test_the_others_name_those_that_do(target: str, tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match=rf"which {target} does not follow; npz, cpp do"):
+        export(made("sbtf"), target, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
