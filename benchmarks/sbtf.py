@@ -6,10 +6,16 @@ Each material is traced from its relief, `--texels` deep and moved under the sur
 three times in `--steps` steps: `neumip` and `sbtf` to plane queries, whose heights are
 found from parallax alone, and `sbtf` to the relief itself (queries on the plane, convex and
 concave; heights given). The band holds the rays whose chord stays above the relief's bottom: all
-others are stopped for certain, and would only flatter. With `--outlines` instead: heights found
-from curved queries, with and without what their opacity says. Truth on cylinders is the tracer;
-that of the torus is the relief on the torus itself, looked at every quarter of a texel along each
-ray. Everything is synthetic.
+others are stopped for certain, and would only flatter. Instead, by option:
+
+    --outlines  heights found from curved queries, with and without what their opacity says
+    --paper     `sbtf` of the relief against `sbtf-paper` in as much CPU time
+    --torus     the fixed torus, eight materials of 64 x 64, 0.88 of the tube's radius deep:
+                outlines of what is solid, of heights found from plane queries, of known ones, and
+                of known ones as the entry's curvature alone would have them; with `--looks`
+
+Truth on cylinders is the tracer; that of the torus is the relief on the torus itself, looked at
+every quarter of a texel along each ray. Everything is synthetic.
 """
 
 from __future__ import annotations
@@ -17,7 +23,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,11 +31,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit import metrics
+from btfkit.conventions import CURVED_LOOKS
 from btfkit.fitting.fit import fit
 from btfkit.fitting.sbtf.tracing import queries_of
 from btfkit.materials.base import Material
 from btfkit.materials.neumip.material import NeuMIPMaterial
 from btfkit.native.neural import bent
+from btfkit.native.neural.lookup import bilinear
 from btfkit.program import Heights
 from btfkit.queries import Query
 from btfkit.relief import procedural
@@ -38,14 +46,18 @@ from btfkit.relief.relief import Relief
 from btfkit.relief.trace import random_queries, trace
 from btfkit.render import picture
 from btfkit.render.preview import Scene, camera_of, render
-from btfkit.shapes.catalogue import shape_of
+from btfkit.shapes.torus import Torus
 
 MATERIALS = ("cobbles", "gravel", "brick", "woven", "grass", "knit")
 A_TEXEL, ROWS, PICTURE = 100, 40000, 256
 BENDS = (0.02, 0.85)  # curvature times depth
 VIEW, LIGHT = (v / np.linalg.norm(v) for v in np.array([[0.5, -0.35, 0.79], [0.3, 0.5, 0.8]]))
-# Of the torus that shapes/torus.py draws.
-RING, TUBE = 2 / 3, 1 / 3
+# The torus: tiles keep their proportions on its central circle, one goes around the tube.
+TUBE, TILES = 0.25, (3, 1)
+RING = 1 - TUBE
+# Of `--torus`: size of the reliefs, and depth as a share of the tube's radius.
+TORUS_SIZE, TORUS_BEND = 64, 0.88
+TORUS_MATERIALS = (*MATERIALS, "perforated", "gauze")
 Floats = NDArray[np.float64]
 
 
@@ -67,17 +79,21 @@ class Asked:
     steps: int
     pictures: Path | None
     outlines: bool
+    paper: bool
+    looks: int
 
 
 def measured(name: str, asked: Asked) -> dict[str, Any]:
     """All figures of one material."""
     relief = procedural.make(name, asked.size, relief_texels=asked.texels).under_surface()[0]
-    models = (on_outlines if asked.outlines else on_sources)(relief, asked)
+    sources = on_outlines if asked.outlines else with_paper if asked.paper else on_sources
+    models = sources(relief, asked)
     band = on_cylinders(relief)
     outline = torus_outline(relief)
     found: dict[str, Any] = {"material": name, "depth_tiles": depth_of(relief)}
     found["models"] = {
         model: {
+            "fit_cpu_s": material.header.provenance["cpu_s"],
             "heights_rms_texels": height_error(material, relief),
             **errors(material, band),
             "plane_psnr": plane_psnr(material, relief),
@@ -101,6 +117,47 @@ def on_sources(relief: Relief, asked: Asked) -> dict[str, Material]:
     }
 
 
+def with_paper(relief: Relief, asked: Asked) -> dict[str, Material]:
+    """`sbtf` of the relief, and the published model in as much CPU time."""
+    ours = fitted(relief, "sbtf", asked, levels=1)
+    spent = ours.header.provenance["cpu_s"]
+    trial = 20
+    few = fitted(relief, "sbtf-paper", replace(asked, steps=trial))
+    steps = max(round(trial * spent / few.header.provenance["cpu_s"]), 1)
+    paper = fitted(relief, "sbtf-paper", replace(asked, steps=steps))
+    return {"sbtf": ours, "sbtf-paper": paper}
+
+
+def on_torus(name: str, asked: Asked) -> dict[str, Any]:
+    """IoU of a material's outlines on the fixed torus."""
+    shape = torus_shape()
+    depth = TORUS_BEND * TUBE / shape.tile
+    relief = procedural.make(name, TORUS_SIZE, relief_texels=depth * TORUS_SIZE).under_surface()[0]
+    relief = replace(relief, height=relief.height * np.float32(depth / depth_of(relief)))
+    truth = torus_outline(relief)
+    plane = random_queries(relief, A_TEXEL * TORUS_SIZE**2, seed=1, samples=4)
+    start = time.process_time()
+    found = fitted(plane, "sbtf", asked, levels=1, looks=asked.looks)
+    spent = time.process_time() - start
+    known = fitted(relief, "sbtf", replace(asked, steps=1), levels=1, looks=asked.looks)
+    flat = replace(relief, height=0 * relief.height, opacity=None)
+    solid = fitted(flat, "sbtf", replace(asked, steps=1), levels=1)
+
+    def iou(material: Material) -> float:
+        return metrics.iou(torus(material).cover > 0.5, truth)
+
+    figures = {"neumip": iou(solid), "found": iou(found), "known": iou(known), "fit_cpu_s": spent}
+    known.thickness = 0.0  # nothing is told of chords then
+    if asked.pictures:
+        draw(asked.pictures / f"{name}.png", [TracedRelief(relief), solid, found])
+    return {"material": name, "looks": asked.looks, **figures, "known, entry alone": iou(known)}
+
+
+def torus_shape() -> Torus:
+    """The torus that outlines are compared on."""
+    return Torus(tube=TUBE, tiles=TILES)
+
+
 def on_outlines(relief: Relief, asked: Asked) -> dict[str, Material]:
     """Models whose heights are found from queries on the plane and on curved surfaces."""
     curved = queries_of(relief, seed=1).subset(slice(A_TEXEL * asked.size**2))
@@ -115,7 +172,10 @@ def on_outlines(relief: Relief, asked: Asked) -> dict[str, Material]:
 def fitted(source: Any, model: str, asked: Asked, **settings: Any) -> Material:
     """A model in as many steps as are asked for."""
     report = fit(source, model=model, steps=asked.steps, holdout=0.02, settings=settings)
-    return report.material
+    material = report.material
+    told = {**material.header.provenance, "cpu_s": report.cpu_seconds}
+    material.header = replace(material.header, provenance=told)
+    return material
 
 
 def depth_of(relief: Relief) -> float:
@@ -123,9 +183,10 @@ def depth_of(relief: Relief) -> float:
     return float(-relief.height.min())
 
 
-def height_error(material: Material, relief: Relief) -> float:
-    """Rms of the heights about their mean offset, texels."""
-    assert isinstance(material, NeuMIPMaterial)
+def height_error(material: Material, relief: Relief) -> float | None:
+    """Rms of the heights about their mean offset, texels; None of a model without heights."""
+    if not isinstance(material, NeuMIPMaterial):
+        return None
     heights = material.layout.surface(material.texels) * material.spec.depth_scale
     return float((heights - relief.height).std() * relief.size[1])
 
@@ -172,39 +233,46 @@ def plane_psnr(material: Material, relief: Relief) -> float:
 
 def torus(material: Material) -> Any:
     """The picture of a torus, one ray a pixel."""
-    scene = Scene(material, shape_of("torus"), LIGHT[None])
+    scene = Scene(material, torus_shape(), LIGHT[None])
     return render(scene, view=VIEW, size=(PICTURE, PICTURE))
 
 
 def torus_outline(relief: Relief) -> NDArray[np.bool_]:
     """(h, w) pixels whose ray meets the relief on the torus, looked at every quarter texel."""
-    shape = shape_of("torus")
+    shape = torus_shape()
     camera = camera_of(shape, VIEW, (PICTURE, PICTURE))
     rows, cols = np.mgrid[:PICTURE, :PICTURE] + 0.5
     origin = camera.origins(np.stack([cols, rows], axis=-1).reshape(-1, 2))
     direction = np.broadcast_to(camera.direction, origin.shape)
     middle = -np.einsum("ij,ij->i", origin, direction)
     step = shape.tile / relief.size[1] / 4
-    hit = np.zeros(len(origin), bool)
+    hit, passed = np.zeros(len(origin), bool), np.zeros(len(origin), bool)
     for way in np.arange(-1, 1, step):
         left = np.flatnonzero(~hit)
         at = origin[left] + (middle[left] + way)[:, None] * direction[left]
-        hit[left] = inside(at, relief, shape.tile)
+        height = (np.hypot(np.hypot(at[:, 0], at[:, 1]) - RING, at[:, 2]) - TUBE) / shape.tile
+        deep = height < -depth_of(relief)
+        passed[left[height > 0]] = False
+        if relief.opacity is not None:
+            # What gets below a sheet with holes has passed it, until it leaves the torus.
+            passed[left[deep]] = True
+            deep &= False
+        near = np.flatnonzero((height <= 0) & ~deep & ~passed[left])
+        deep[near] = inside(at[near], height[near], relief)
+        hit[left] = deep
     return hit.reshape(PICTURE, PICTURE)
 
 
-def inside(at: Floats, relief: Relief, tile: float) -> NDArray[np.bool_]:
-    """(m,) whether points (m, 3) lie below the relief on the torus."""
+def inside(at: Floats, height: Floats, relief: Relief) -> NDArray[np.bool_]:
+    """(m,) whether points (m, 3) at heights (m,), tiles, lie in the relief on the torus."""
+    ring = np.arctan2(at[:, 0], at[:, 1]) / (2 * np.pi)
     from_axis = np.hypot(at[:, 0], at[:, 1])
-    height = (np.hypot(from_axis - RING, at[:, 2]) - TUBE) / tile
-    found = height < -depth_of(relief)
-    near = np.flatnonzero((height <= 0) & ~found)
-    around = round(2 * np.pi * RING / tile)
-    ring = np.arctan2(at[near, 0], at[near, 1]) / (2 * np.pi)
-    tube = np.arctan2(at[near, 2], from_axis[near] - RING) / (2 * np.pi)
-    uv = np.stack([ring * around + 0.5, (tube - 0.25) * (around // 2) + 0.5], axis=1)
-    found[near] = height[near] < bent.bilinear(relief.height[..., None], uv, wrap=True)[:, 0]
-    return found
+    tube = np.arctan2(at[:, 2], from_axis - RING) / (2 * np.pi)
+    uv = np.stack([ring * TILES[0] + 0.5, (tube - 0.25) * TILES[1] + 0.5], axis=1)
+    found = height < bilinear(relief.height[..., None], uv, wrap=True)[:, 0]
+    if relief.opacity is not None:
+        found &= bilinear(relief.opacity[..., None], uv, wrap=True)[:, 0] >= 0.5
+    return np.asarray(found)
 
 
 def cost(material: Material, query: Query) -> dict[str, float]:
@@ -237,16 +305,22 @@ def draw(path: Path, materials: list[Material]) -> None:
 def main() -> None:
     """One line of JSON a material."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("materials", nargs="*", default=MATERIALS)
+    parser.add_argument("materials", nargs="*")
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--texels", type=float, default=6.0)
     parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--outlines", action="store_true", help="what outlines add to heights")
+    parser.add_argument("--paper", action="store_true", help="against sbtf-paper")
+    parser.add_argument("--torus", action="store_true", help="outlines on the fixed torus")
+    parser.add_argument("--looks", type=int, default=CURVED_LOOKS, help="of --torus")
     given = parser.parse_args()
-    asked = Asked(given.size, given.texels, given.steps, given.pictures, given.outlines)
-    for name in given.materials:
-        print(json.dumps(measured(name, asked)), flush=True)
+    asked = Asked(given.size, given.texels, given.steps, given.pictures, given.outlines,
+                  given.paper, given.looks)  # fmt: skip
+    names = given.materials or (TORUS_MATERIALS if given.torus else MATERIALS)
+    for name in names:
+        found = on_torus(name, asked) if given.torus else measured(name, asked)
+        print(json.dumps(found), flush=True)
 
 
 if __name__ == "__main__":

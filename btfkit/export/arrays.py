@@ -38,10 +38,19 @@ def textures(program: Program) -> Iterator[Texture]:
         yield program.scaling
     if isinstance(program.depth, DepthNetwork):
         yield program.depth.texture
+    yield from holes(program)
 
 
 # Targets that follow rays which curvature bends.
-BENT = ("npz", "cpp")
+BENT = ("npz", "cpp", "glsl")
+
+
+def holes(program: Program) -> list[Texture]:
+    """The opacity of heights as a texture; none where they have none."""
+    found = program.depth
+    if not isinstance(found, Heights) or found.opacity is None:
+        return []
+    return [Texture("opacity", (found.opacity[..., None],))]
 
 
 def refuse_unknown(program: Program, target: str = "") -> None:

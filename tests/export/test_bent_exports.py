@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import shutil
 import subprocess
 import sys
@@ -14,7 +16,10 @@ from cases import BENT, directions, made
 
 from btfkit.export import TARGETS
 from btfkit.export.arrays import BENT as FOLLOW
+from btfkit.export.glsl import drawable, encoded
+from btfkit.export.glsl.atlas import quantised
 from btfkit.export.package import ASKED, export
+from btfkit.export.sections import whole_text
 from btfkit.materials.base import Material
 from btfkit.native.neural import plain
 from btfkit.queries import Response
@@ -110,6 +115,53 @@ def test_the_header_follows_bent_rays(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("target", sorted(set(TARGETS) - {*ASKED, *FOLLOW}))
 def test_the_others_name_those_that_do(target: str, tmp_path: Path) -> None:
-    with pytest.raises(TypeError, match=rf"which {target} does not follow; npz, cpp do"):
+    with pytest.raises(TypeError, match=rf"which {target} does not follow; npz, cpp, glsl do"):
         export(made("sbtf"), target, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_the_shader_follows_bent_rays(tmp_path: Path) -> None:
+    import browser
+    from test_glsl import _PAGE
+
+    queries = asked(1200)
+    plain_rows = [k for k in range(1200) if not 420 <= k < 440]
+    queries = {name: part[plain_rows] for name, part in queries.items()}
+    n, shaders = len(plain_rows), []
+    packed = np.zeros((n, 3, 4), np.float32)
+    packed[:, 0, :2], packed[:, 0, 2] = queries["uv"], queries["footprint"]
+    packed[:, 0, 3] = queries["curvature"]
+    packed[:, 1, :3], packed[:, 2, :3] = queries["light"], queries["view"]
+    for name in BENT:
+        shader = drawable(made(name).program(), model=name)
+        shaders.append({
+            "about": shader.about, "source": shader.source, "channels": 3,
+            "data": {key: encoded(data) for key, data in shader.data.items()},
+        })  # fmt: skip
+    page = tmp_path / "page.html"
+    asking = _PAGE.replace("q[0].z, value", "q[0].z, q[0].w, value")
+    page.write_text(asking % {
+        "upload": whole_text("upload.js"), "n": n, "queries": encoded(packed.tobytes()),
+        "shaders": json.dumps(shaders),
+    })  # fmt: skip
+    seen = browser.load(page)
+    assert seen.errors == []
+    for name, text in zip(BENT, seen.text("out").split(","), strict=True):
+        found = np.frombuffer(base64.b64decode(text), "<f4").reshape(n, 4)
+        material = made(name)
+        near = quantised(material.program(), "half")
+        uv = queries["uv"] - np.floor(queries["uv"]) if near.wrap else queries["uv"].clip(0, 1)
+        low, high = material.sharpest  # type: ignore[attr-defined]
+        bend = queries["curvature"].clip(low, high).astype(np.float32)
+        rgb, opacity = plain.answer(
+            near, uv, queries["light"], queries["view"], queries["footprint"], bend
+        )
+        rows = settled(material, queries)
+        same = found[:, 3] == opacity
+        assert same[rows].mean() > 0.995
+        off = np.abs(found[:, :3] - rgb) / np.maximum(1, np.abs(rgb))
+        # Polynomials of 1e-7 and divisions of 2.5 units: a place of 1e-6 tiles, random texels.
+        assert np.mean(off[rows & same].max(axis=1) < 2e-3) > 0.99
+        assert 0.02 < (opacity == 0).mean() < 0.7

@@ -115,6 +115,8 @@ def quantised(program: Program, texels: Texels) -> Program:
     depth: Any = program.depth
     if isinstance(depth, Heights) and made.heights is not None:
         depth = replace(depth, heights=made.heights.astype(np.float32))
+        if depth.opacity is not None:
+            depth = replace(depth, opacity=found["opacity"][0][..., 0])
     elif depth is not None:
         depth = replace(depth, texture=exchanged(depth.texture))
     return replace(

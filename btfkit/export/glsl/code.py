@@ -3,18 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.conventions import LEVELS_UNIT, LOOKS, LOWEST_COSINE, MOST_LOG, STEEPEST
+from btfkit.conventions import (
+    CURVATURE_UNIT,
+    CURVED_FINER,
+    LEVELS_UNIT,
+    LOOKS,
+    LOWEST_COSINE,
+    LOWEST_SEEN,
+    MOST_BEND,
+    MOST_LOG,
+    SLACK,
+    STEEPEST,
+)
+from btfkit.export.arrays import holes
 from btfkit.export.glsl import layers
 from btfkit.export.glsl.atlas import Atlas
 from btfkit.export.glsl.layers import Source, Weights, vec4
 from btfkit.export.numbers import literal
 from btfkit.export.sections import filled, sections
+from btfkit.native.neural import bent
 from btfkit.native.neural.plain import YUV_TO_RGB
 from btfkit.program import DepthNetwork, Heights, Program, Texture
 
@@ -56,6 +69,8 @@ def shader(program: Program, atlas: Atlas, *, model: str) -> Shader:
     looks = "".join(_look(texture, atlas) for texture in _looked(program))
     function = filled("".join(parts[name] for name in last), **values)
     text = head + looks + function + "".join(f"  {line}\n" for line in body) + "}\n"
+    if curved(program):
+        text += filled(parts["on_the_plane"], **values)
     return Shader(text, None if wide is None else _texture(wide.rows))
 
 
@@ -67,7 +82,8 @@ def _texture(rows: list[NDArray[Any]]) -> NDArray[np.float32]:
 
 def _looked(program: Program) -> list[Texture]:
     depth = [program.depth.texture] if isinstance(program.depth, DepthNetwork) else []
-    return [*depth, *program.textures, *([program.scaling] if program.scaling else [])]
+    return [*depth, *program.textures, *([program.scaling] if program.scaling else []),
+            *holes(program)]  # fmt: skip
 
 
 def _chosen(program: Program, *, wide: bool) -> tuple[list[str], list[str]]:
@@ -83,8 +99,10 @@ def _chosen(program: Program, *, wide: bool) -> tuple[list[str], list[str]]:
     first += ["sine"] * any(layer.activation == "sine" for layer in every)
     first += ["disc"] * disc + ["step"] * (depth is not None)
     half = program.frames > 0 or inputs & {"hx", "hy", "hz", "cos_diff"}
-    last = ["evaluate", "level" if program.leveled else "no_level"] + ["half"] * bool(half)
-    return first, last + ["march_depth"] * marched
+    bent_ = curved(program)
+    last = ["bent"] * bent_ + ["evaluate", "level" if program.leveled else "no_level"]
+    last += ["bent_depth"] * bent_ + ["half"] * bool(half)
+    return first, last + ["march_depth"] * (marched and not bent_)
 
 
 def _values(program: Program, model: str) -> dict[str, object]:
@@ -95,6 +113,7 @@ def _values(program: Program, model: str) -> dict[str, object]:
         "reduced": "uv - floor(uv)" if program.wrap else "clamp(uv, 0.0, 1.0)",
         "to_tile": "  at -= floor(at);\n" if program.wrap else "  at = clamp(at, 0.0, 1.0);\n",
     }  # fmt: skip
+    found |= _curvature(program)
     if isinstance(program.depth, Heights):
         heights = program.depth.heights.astype(np.float16).astype(np.float32)
         found |= {
@@ -102,6 +121,36 @@ def _values(program: Program, model: str) -> dict[str, object]:
             "rise": literal(heights.max() - heights.min()), "scale": literal(program.depth.scale),
         }  # fmt: skip
     return found
+
+
+def curved(program: Program) -> bool:
+    """Whether curvature bends rays."""
+    return isinstance(program.depth, Heights) and program.depth.curved
+
+
+def _curvature(program: Program) -> dict[str, object]:
+    """What a shader says of curvature: nothing where rays are straight."""
+    found = program.depth
+    if not (isinstance(found, Heights) and found.curved):
+        return {"more": ""}
+    near = replace(found, heights=found.heights.astype(np.float16).astype(np.float32))
+    top, bottom = max(float(near.heights.max()), 0.0), min(float(near.heights.min()), 0.0)
+    low, high = bent.sharpest(near)
+    reach, name = literal(bent.hole_range(near)), variable(Texture("opacity", ()))
+    hole = (
+        f"  vec4 solid;\n  btfkit_look_{name}(at, 0.0, solid);\n"
+        f"  gap = max(gap - {literal(SLACK * bent.hole_range(near))}, (0.5 - solid.x) * {reach});\n"
+    )
+    return {
+        "more": "float curvature, ",
+        "hole": hole if found.opacity is not None else "",
+        "holes": "true" if found.opacity is not None else "false",
+        "least_bend": literal(-MOST_BEND / max(top, 1e-6)),
+        "most_bend": literal(MOST_BEND / max(-bottom, 1e-6)),
+        "surface": literal(top), "bottom": literal(bottom),
+        "flattest": literal(max(low, -1e30)), "sharpest": literal(min(high, 1e30)),
+        "finer": literal(CURVED_FINER), "more_looks": found.looks, "seen": literal(LOWEST_SEEN),
+    }  # fmt: skip
 
 
 def _look(texture: Texture, atlas: Atlas) -> str:
@@ -177,7 +226,11 @@ def _vectors(inputs: Iterable[str], prefix: str) -> tuple[list[str], list[Source
     wanted, lines, found = set(inputs), [], []
     for k, source in enumerate(VECTORS):
         if wanted & {name for name in source.names if name}:
-            lines.append(f"vec4 {prefix}{k} = {source.text};")
+            text = source.text
+            if "curvature" in wanted and "curvature" in source.names:
+                bend = f"curvature / (abs(curvature) + {literal(CURVATURE_UNIT)})"
+                text = text.replace("0.0, 0.0, 0.0)", f"{bend}, 0.0, 0.0)")
+            lines.append(f"vec4 {prefix}{k} = {text};")
             found.append(Source(f"{prefix}{k}", source.names))
     return lines, found
 
@@ -200,9 +253,11 @@ def _features(program: Program) -> list[str]:
     for texture in [*program.textures, *([program.scaling] if program.scaling else [])]:
         moves = []
         if program.depth is not None and texture.view:
-            moves.append(f"{literal(texture.view)} * btfkit_step(view)")
+            way = "toward" if curved(program) else "btfkit_step(view)"
+            moves.append(f"{literal(texture.view)} * {way}")
         if program.depth is not None and texture.light:
-            moves.append(f"{literal(-texture.light)} * btfkit_step(light)")
+            way = "away" if curved(program) else "btfkit_step(light)"
+            moves.append(f"{literal(-texture.light)} * {way}")
         place = f"uv + depth * ({' + '.join(moves)})" if moves else "uv"
         lines += _called(texture, place, "level")
     return lines

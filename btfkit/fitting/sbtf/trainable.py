@@ -111,6 +111,16 @@ class SBTF(Marching[Settings]):
             self._heed_outlines(progress)
         return loss
 
+    def untrained(self) -> tuple[str, ...]:
+        source = self._data
+        if not isinstance(source, BTF) and source.curvature is not None and source.curvature.any():
+            return ()
+        heights = "a known relief" if self._given is not None else "the parallax of its views"
+        return (
+            "curved surfaces: nothing was measured there; outlines and displaced places are those "
+            f"of heights from {heights}, colours those of the plane where a ray ends",
+        )
+
     @property
     def _outlined(self) -> bool:
         """Whether the data say which rays pass."""
