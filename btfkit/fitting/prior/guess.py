@@ -26,7 +26,7 @@ Array = NDArray[np.float32]
 Floats = NDArray[Any]
 
 # Values (texels times pairs) that lobes are fitted to: a second or two of one thread.
-_MOST_VALUES, _MOST_PAIRS = 400_000, 96
+_MOST_VALUES, _MOST_PAIRS = 250_000, 96
 # Bytes of the textures of these pairs, at full size.
 _MOST_BYTES = 128 << 20
 # Lights tell slopes if they are at least so many, and spread at least so far about their mean.
@@ -35,10 +35,13 @@ _LEAST_LIGHTS, _LEAST_SPREAD = 4, 0.15
 _STEEPEST = 2.0
 # How far measured detail may lighten or darken what the reduced grid says.
 _MOST_DETAIL = 4.0
-# Two guesses that err apart err less together: Lambert's share at the horizon is half with few
-# lights, and falls to half of that with this many.
+# Two guesses that err apart err less together: Lambert's share of oblique answers is half with few
+# lights, and falls to half of that with this many; more, where the relief explains little.
 _LAMBERT, _LAMBERT_LIGHTS = 0.5, 24
 _SAMPLES = 8
+# Pairs that tell how much a relief leaves of Lambert's error; what it may leave and be trusted at
+# the horizon, and how much more makes it worth nothing there.
+_LOOKED_AT, _TRUSTED, _UNTRUSTED = 16, 0.15, 0.45
 
 
 @final
@@ -85,7 +88,8 @@ class Guess:
         if self.detail is not None and blur <= 0.5:
             values = values * self._looked(self.detail, at / [low[1], low[0]])
         lambert = self._looked(self.albedo, uv) * np.maximum(rays[0][:, 2:], 0)
-        share = self.share * (1 - rays[1][:, 2:])
+        # Seen from above a relief hides and displaces nothing, however wrong it is.
+        share = self.share * np.sqrt(np.maximum(1 - np.square(rays[1][:, 2:]), 0))
         mixed = share * np.log1p(lambert) + (1 - share) * np.log1p(np.maximum(values, 0))
         return np.expm1(mixed).astype(np.float32)
 
@@ -125,16 +129,40 @@ def guessed(btf: BTF, pairs: NDArray[np.intp]) -> Guess:
         if not stack.wrap:
             # A flat sample: what leans as a whole is a lamp that stands elsewhere.
             slope = slope - slope.mean(axis=(0, 1))
-        found = integrate(slope, counts.reshape(low), wrap=stack.wrap).height
-        height = (found / low[1]).astype(np.float32)
+        risen = integrate(slope, counts.reshape(low), wrap=stack.wrap).height
+        height = (risen / low[1]).astype(np.float32)
     relief = maps.relief(height, wrap=btf.wrap, channels=btf.channels)
     detail = None
     if low != (h, w):
         coarse = enlarged(averaged(albedo, low), (h, w))
         ratio = (albedo + 1e-3) / (coarse + 1e-3)
         detail = np.clip(ratio, 1 / _MOST_DETAIL, _MOST_DETAIL).astype(np.float32)
-    share = _LAMBERT * _LAMBERT_LIGHTS / (_LAMBERT_LIGHTS + len(stack.lights))
-    return Guess(geometry(relief), low, detail, albedo, height, relief.normals(), share, stack.wrap)
+    found = geometry(relief)
+    wrong = float(np.clip((_left(found, stack, values) - _TRUSTED) / _UNTRUSTED, 0, 1))
+    few = _LAMBERT * _LAMBERT_LIGHTS / (_LAMBERT_LIGHTS + len(stack.lights))
+    return Guess(found, low, detail, albedo, height, relief.normals(), max(few, wrong), stack.wrap)
+
+
+def _left(relief: tracer.Geometry, stack: Stack, values: Array) -> float:
+    """The error of a relief's answers for some of its own pairs, in parts of Lambert's."""
+    few = spread(stack.light, _LOOKED_AT)
+    rows, cols, _, c = values.shape
+    place = np.stack(np.mgrid[:rows, :cols][::-1], axis=-1).reshape(-1, 2).astype(np.float32)
+    sharp = np.full(len(place), 0.5, np.float32)
+    true = values[:, :, few].reshape(-1, len(few), c)
+    known = np.isfinite(true)
+    cosine = stack.light[few, 2][None, :, None]
+    summed = (np.where(known, true, 0) * cosine).sum(axis=1)
+    albedo = summed / np.maximum((known * cosine**2).sum(axis=1), 1e-9)
+    rays = [[np.broadcast_to(d[k], (len(place), 3)) for d in (stack.light, stack.view)]
+            for k in few]  # fmt: skip
+    traced = [tracer.trace(relief, place, *pair, sharp).rgb for pair in rays]
+    measured = np.log1p(np.maximum(np.where(known, true, 0), 0))
+    ours, plain = (
+        float(np.square((np.log1p(np.maximum(found, 0)) - measured) * known).mean())
+        for found in (np.stack(traced, axis=1), albedo[:, None] * cosine)
+    )
+    return ours / max(plain, 1e-12)
 
 
 def _few(btf: BTF, pairs: NDArray[np.intp], most: int) -> NDArray[np.intp]:
