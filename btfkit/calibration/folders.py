@@ -10,11 +10,11 @@ from typing import Any, final
 import numpy as np
 
 from btfkit import documents
-from btfkit.calibration import falloff, report, rti, stages
+from btfkit.calibration import falloff, plots, report, rti, stages
 from btfkit.calibration.calibration import NAME, Calibration
 from btfkit.calibration.sensor_stage import NOISELESS_GAIN
 from btfkit.errors import CalibrationError
-from btfkit.files import refuse_existing
+from btfkit.files import refuse_existing, whole
 from btfkit.sequence import TABLE, Sequence
 
 Progress = Callable[[float, float], None]
@@ -40,7 +40,7 @@ class Photographs:
 
 
 def calibrate_sequence(
-    folder: Path, out: Path | None, *, force: bool, progress: Progress
+    folder: Path, out: Path | None, *, force: bool, progress: Progress, preview: bool = True
 ) -> dict[str, Any]:
     """Calibrate a sequence; sections whose inputs are unchanged are kept.
 
@@ -50,6 +50,7 @@ def calibrate_sequence(
             date where it is there.
         force: whether another existing document is replaced, and everything is made anew.
         progress: called with what is done, and of how much.
+        preview: whether a small picture of the lights is left beside the document.
 
     Returns:
         Figures and paths, as JSON's own types.
@@ -66,6 +67,7 @@ def calibrate_sequence(
     return {
         "out": final, "report": page, "ran": ran, "missing": dict(found.missing),
         "figures": figures(found),
+        **(_preview(final, lights) if preview and lights is not None else {}),
     }  # fmt: skip
 
 
@@ -91,7 +93,13 @@ def figures(found: Calibration) -> dict[str, Any]:
 
 
 def calibrate_photographs(
-    folder: Path, out: Path | None, how: Photographs, *, force: bool, progress: Progress
+    folder: Path,
+    out: Path | None,
+    how: Photographs,
+    *,
+    force: bool,
+    progress: Progress,
+    preview: bool = True,
 ) -> dict[str, Any]:
     """The lights of a folder of photographs, as an .lp file with its report beside it.
 
@@ -124,11 +132,15 @@ def calibrate_photographs(
     report.write_light_report(
         table, record.get("falloff"), page, title=folder.resolve().name, force=True
     )
+    lights = np.array([light.direction for light in table.found])
+    # Among the photographs it would be one of them the next time.
+    within = final.resolve().parent == folder.resolve()
     return {
         "out": final, "report": page, "data": beside, "corrected": even,
         "lights": record["lights"], "positions": record["positions"], "spheres": len(table.spheres),
         "error_deg": table.error_deg, "unit": table.unit, "without_light": record["without_light"],
         "falloff_rms": record["falloff"]["rms"] if even is not None else None,
+        **(_preview(final, lights) if preview and not within else {}),
     }  # fmt: skip
 
 
@@ -141,3 +153,13 @@ def _lights(sequence: Sequence) -> Any:
         return np.array([placed.directions(frame, np.zeros(3))[0] for frame in frames])
     except CalibrationError:
         return None
+
+
+def _preview(final: Path, lights: Any) -> dict[str, Path]:
+    """The lights seen from above, as a small picture beside a document."""
+    path = final.with_name(f"{final.stem}.preview.png")
+    known = lights[np.isfinite(lights).all(axis=1)]
+    # It belongs to the document, which was new or was to be replaced.
+    with whole(path, force=True) as partial:
+        partial.write_bytes(plots.sky_png(known))
+    return {"preview": path}

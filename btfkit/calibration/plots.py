@@ -29,6 +29,19 @@ def svg(draw: Draw, *, size: tuple[float, float] = (5.2, 3.2), polar: bool = Fal
     return re.sub(r"^.*?(?=<svg)", "", text, flags=re.DOTALL)
 
 
+def sky_png(directions: Any) -> bytes:
+    """PNG of directions (n, 3) seen from above, coloured by their order."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(3.2, 2.8), dpi=72, layout="constrained")
+    FigureCanvasAgg(figure)
+    sky(directions, np.arange(len(directions)), "frame")(figure.add_subplot(projection="polar"))
+    out = io.BytesIO()
+    figure.savefig(out, format="png", metadata={"Software": None})
+    return out.getvalue()
+
+
 def transfer(data: Mapping[str, Any]) -> Draw:
     """Variance over signal, and the line through it."""
 

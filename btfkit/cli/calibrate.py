@@ -13,6 +13,7 @@ from btfkit.cli.bar import Bar
 from btfkit.cli.many import cluster_option, over, the_one
 from btfkit.cli.options import force_option, out_option
 from btfkit.cli.outcome import Outcome, verb
+from btfkit.cli.preview import preview_option
 
 
 @verb(
@@ -37,6 +38,7 @@ btfkit calibrate monday/ tuesday/ --cluster local:2""",
     "--transfer", default="srgb", show_default=True, help="Of photographs: srgb, linear or 2.2."
 )
 @cluster_option
+@preview_option
 @force_option
 def calibrate_verb(
     bar: Bar,
@@ -44,6 +46,7 @@ def calibrate_verb(
     sources: tuple[Path, ...],
     out: Path | None,
     cluster: str | None,
+    preview: bool,
     force: bool,
     **options: Any,
 ) -> Outcome:
@@ -55,17 +58,19 @@ def calibrate_verb(
     a task each; `btfkit ingest SEQUENCE… --cluster` then rectifies, a task a shard.
     """
     if not cluster:
-        return _calibrated(the_one(sources, "sequences"), out, force, options, bar)
+        return _calibrated(the_one(sources, "sequences"), out, force, options, bar, preview)
     if out and len(sources) > 1:
         raise click.UsageError("each of several sequences keeps its calibration: leave out -o")
     given = {n: v.absolute() if isinstance(v, Path) else v for n, v in options.items()}
     target = out.absolute() if out else None
-    tasks = {str(source.absolute()): (target, force, given) for source in sources}
+    tasks = {str(source.absolute()): (target, force, given, preview) for source in sources}
     return over(cluster, tasks, _task, bar)
 
 
-def _task(source: str, out: Path | None, force: bool, options: Mapping[str, Any]) -> Outcome:
-    return _calibrated(Path(source), out, force, options, _unheard)
+def _task(
+    source: str, out: Path | None, force: bool, options: Mapping[str, Any], preview: bool
+) -> Outcome:
+    return _calibrated(Path(source), out, force, options, _unheard, preview)
 
 
 def _unheard(done: float, total: float) -> None:
@@ -78,6 +83,7 @@ def _calibrated(
     force: bool,
     options: Mapping[str, Any],
     bar: Callable[[float, float], None],
+    preview: bool,
 ) -> Outcome:
     """Calibrate one folder."""
     from btfkit.calibration.calibration import NAME
@@ -87,13 +93,14 @@ def _calibrated(
     if not source.is_dir():
         raise FileNotFoundError(f"{source} is not a folder")
     if (source / TABLE).exists():
-        data = calibrate_sequence(source, out, force=force, progress=bar)
+        data = calibrate_sequence(source, out, force=force, progress=bar, preview=preview)
         then = f"btfkit ingest {shlex.quote(str(source))}"
         # A document elsewhere is not read along with the sequence.
         if data["out"] != source / NAME:
             then += f" --calibration {shlex.quote(str(data['out']))}"
         return Outcome(_of_sequence(data), data, then=then)
-    data = calibrate_photographs(source, out, Photographs(**options), force=force, progress=bar)
+    how = Photographs(**options)
+    data = calibrate_photographs(source, out, how, force=force, progress=bar, preview=preview)
     return Outcome(_of_lights(data), data, then=f"btfkit ingest {shlex.quote(str(data['out']))}")
 
 

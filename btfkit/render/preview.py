@@ -30,7 +30,7 @@ Ints = NDArray[np.intp]
 _BLOCK, _MOST_SHEETS, _NOTHING = 1 << 18, 64, 1e-3
 # Lights times points whose answers are held at once, and points below which that saves nothing.
 _HELD, _FEWEST = 1 << 19, 1 << 11
-# Rays a pixel that are followed in one pass, so that a lazy BTF is decoded once.
+# Rays a pixel that are followed in one pass.
 _ONE_PASS = 4
 _ABOVE = np.array([0.0, 0.0, 1.0], np.float32)
 
@@ -135,7 +135,10 @@ def render(
     )
     radiance, cover = np.zeros((h * w, c)), np.zeros(h * w)
     start, done, interrupted = time.perf_counter(), 0, False
-    for some in _passes(samples, within_s):
+    # A lazy BTF decodes its textures anew in every pass.
+    arrays = scene.material.weights.values()
+    lazy = not all(isinstance(array, np.ndarray) for array in arrays)
+    for some in _passes(samples, whole=within_s is None and (lazy or samples <= _ONE_PASS)):
         spent = time.perf_counter() - start
         if done and within_s is not None and spent * (1 + len(some) / done) > within_s:
             break
@@ -161,10 +164,9 @@ def render(
     )
 
 
-def _passes(samples: int, within_s: float | None) -> list[range]:
-    """Which samples each pass takes: few at first where time is short or pixels take many."""
-    first = samples if within_s is None and samples <= _ONE_PASS else 1
-    bounds = [0, min(first, samples)]
+def _passes(samples: int, *, whole: bool) -> list[range]:
+    """Which samples each pass takes: one at first, then as many as before; or all at once."""
+    bounds = [0, samples if whole else 1]
     while bounds[-1] < samples:
         bounds.append(min(2 * bounds[-1], samples))
     return [range(a, b) for a, b in itertools.pairwise(bounds)]

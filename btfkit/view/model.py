@@ -46,7 +46,8 @@ def page(
     }  # fmt: skip
     return composed(
         "model", "model.js", title=title,
-        upload=whole_text("upload.js"), material=in_script(carried),
+        upload=whole_text("upload.js"), mesh=section("mesh.js.txt", "mesh"),
+        material=in_script(carried),
     )  # fmt: skip
 
 

@@ -426,6 +426,7 @@ def test_the_verb_calibrates_a_sequence_and_keeps_what_it_knows(folder, capsys):
     assert call("calibrate", folder, "--json") == 0
     data = last_json(capsys)
     assert data["ran"] == WITHOUT_BOARD
+    assert Path(data["preview"]).name == "calibration.preview.png"
     assert data["figures"]["worst_grey"] < 5e-3
     page = Path(data["report"]).read_text()
     assert page.count("<svg") >= 6
@@ -458,6 +459,12 @@ def test_the_verb_writes_the_lights_of_photographs(tmp_path, capsys):
     assert len(btfkit.open(data["out"])) == 4
     assert json.loads(Path(data["data"]).read_text())["unit"] == "mm"
     assert "<svg" in Path(data["report"]).read_text()
+    # A picture among the photographs would be one of them the next time.
+    assert "preview" not in data
+    assert call("calibrate", photographs, "-o", tmp_path / "x.lp", "--json") == 0
+    preview = Path(last_json(capsys)["preview"])
+    assert preview == tmp_path / "x.preview.png"
+    assert cv2.imread(str(preview)).std() > 5
     assert call("calibrate", photographs, "-o", tmp_path / "x.json") == 1
     assert "its lights are written as .lp; write -o x.lp" in capsys.readouterr().err
     assert call("calibrate", tmp_path / "nowhere") == 1

@@ -348,3 +348,53 @@ def test_a_measurement_that_is_not_the_models_is_refused() -> None:
         model.page(fitted(), title="x", measured=replace(btf, channels=("a", "b", "c")))
     with pytest.raises(ValueError, match="their tiles have other proportions"):
         model.page(fitted(), title="x", measured=btf.crop(slice(0, 8), slice(0, 16)))
+
+
+def test_a_dropped_mesh_shows_what_the_renderer_draws_of_it(tmp_path: Path) -> None:
+    lines, n = [], 48
+    for j in range(n // 2 + 1):
+        for i in range(n + 1):
+            polar, azimuth = np.pi * (0.02 + 0.96 * j / (n // 2)), 2 * np.pi * i / n
+            sin, bump = np.sin(polar), 1 + 0.1 * np.sin(3 * azimuth)
+            at = np.array([sin * np.sin(azimuth), np.cos(polar), sin * np.cos(azimuth)])
+            lines += [
+                "v {:.7g} {:.7g} {:.7g}".format(*(2 * bump * at)),
+                f"vt {i / n:.7g} {1 - j / (n // 2):.7g}",
+            ]
+            lines += ["vn {:.7g} {:.7g} {:.7g}".format(*at)]
+    for j in range(n // 2):
+        for i in range(n):
+            a = j * (n + 1) + i + 1
+            lines.append("f " + " ".join(f"{k}/{k}/{k}" for k in (a, a + n + 1, a + n + 2, a + 1)))
+    text = "\n".join(lines)
+    (tmp_path / "bumps.obj").write_text(text)
+    material = made("neumip")
+    script = f"""{ENCODE}
+      view.take({json.dumps(text)}, "<b>bumps</b>.obj");
+      Object.assign(view.state, {{repeat: 2, eye: [35, 250], light: [50, 240]}});
+      const found = [1, 2, 3, 4].map((show) => coded(view.read(show, {W}, {H})));
+      const said = document.getElementById("numbers").textContent;
+      view.take("v 0 0 0\\nv 1 0 0\\nv 0 1 0\\nf 1 2 3", "bare.obj");
+      return {{found, said, refused: document.getElementById("numbers").textContent, shape: view.state.shape}};"""
+    told = probed(model.page(material, title="x"), script, tmp_path)
+    assert told["said"] == f"mesh<b>bumps</b>.obj: {n * n} triangles"
+    assert "faces without texture coordinates" in told["refused"]
+    numbers = np.stack(
+        [np.frombuffer(base64.b64decode(x), "<f4").reshape(H, W, 4)[::-1] for x in told["found"]]
+    )
+    form = shape_of(str(tmp_path / "bumps.obj"), repeat=2, aspect=material.header.aspect)
+    eye, lamp = (from_angles(*np.radians(angles)) for angles in ([35.0, 250.0], [50.0, 240.0]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        drawn = render(Scene(material, form, lamp[None]), view=eye, size=(H, W))
+    # Pixels at the silhouette belong to one or the other.
+    assert np.mean((numbers[0, ..., 3] > 0) != (drawn.cover > 0.5)) < 0.005
+    both = (numbers[0, ..., 3] > 0) & (drawn.cover > 0.5)
+    assert both.sum() > 1500
+    error = np.abs(numbers[3, ..., :3] - drawn.radiance)[both].max(axis=1)
+    # Graphics cards move corners to fractions of a pixel, and with them uv: here by 4e-4 of a tile.
+    # The page casts no shadow of a mesh on itself; the light comes from near the eye.
+    assert np.median(error) < 4e-3
+    assert np.mean(error > 0.05) < 0.05
+    wanted, found = answered(quantised(material.program(), "half"), numbers)
+    assert np.mean(np.abs(found - wanted) > 2e-4 * np.maximum(1, np.abs(wanted))) <= 1e-3

@@ -54,8 +54,8 @@ function btfkitBind(gl, program, made) {
   });
 }
 
-function btfkitProgram(gl, fragment) {
-  const corner = "#version 300 es\nvoid main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }";
+function btfkitProgram(gl, fragment, vertex) {
+  const corner = vertex || "#version 300 es\nvoid main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }";
   const program = gl.createProgram();
   for (const [kind, text] of [[gl.VERTEX_SHADER, corner], [gl.FRAGMENT_SHADER, fragment]]) {
     const shader = gl.createShader(kind);

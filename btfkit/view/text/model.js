@@ -5,7 +5,7 @@ const view = (() => {
   const MEASURED = MATERIAL.measured;
   const canvas = document.getElementById("picture"), by = (id) => document.getElementById(id);
   const state = {}, pixelShown = {};
-  let gl, program, uniforms, floats, drag = "eye", asked = false, coarse = 1, frameMs = 0;
+  let gl, flat, mesh = null, made, uniforms, floats, drag = "eye", asked = false, coarse = 1, frameMs = 0;
 
   function fail(message) {
     by("failed").textContent = message;
@@ -40,7 +40,7 @@ const view = (() => {
   function camera(w, h) {
     const {eye: angles_, shape} = now(), eye = way(angles_), aspect = MATERIAL.aspect;
     const up = Math.abs(eye[1]) < 1 - 1e-9 ? [0, 1, 0] : [0, 0, -eye[1]];
-    const half = {plane: 1, sphere: 1.04, torus: 1.04, cylinder: 1.04 * Math.hypot(1, Math.PI / aspect / 2)}[shape];
+    const half = {plane: 1, sphere: 1.04, torus: 1.04, mesh: 1.04, cylinder: 1.04 * Math.hypot(1, Math.PI / aspect / 2)}[shape];
     const right = unit(cross(up, eye)), pixel = 2 * half * Math.max(1, h / w) / state.zoom / h;
     return {eye, right: scaled(right, pixel), down: scaled(cross(eye, right), -pixel)};
   }
@@ -48,12 +48,18 @@ const view = (() => {
   function tiles() {
     const {repeat: n, shape} = now(), a = MATERIAL.aspect;
     if (shape === "plane") return [2 / n, 2 / n / a];
+    if (shape === "mesh") return [n, n * a];
     if (shape === "torus") return [4 * n, Math.max(Math.round(4 * n * a / 2), 1)];
     return [Math.PI / n, Math.PI / n / a];
   }
 
-  function draw(show, w, h, corner = [0, 0]) {
-    const c = camera(w, h), [tile, tileHeight] = tiles();
+  // A picture of w x h pixels, or the part of it that begins at `corner` and is `shown` large.
+  function draw(show, w, h, corner = [0, 0], shown = [w, h]) {
+    const c = camera(w, h), [tile, tileHeight] = tiles(), meshed = now().shape === "mesh", used = meshed ? mesh : flat;
+    gl.useProgram(used.program);
+    uniforms = used.uniforms;
+    gl.bindVertexArray(used.vertices);
+    gl.uniform2f(uniforms.shown, ...shown);
     gl.uniform2f(uniforms.size, w, h);
     gl.uniform2f(uniforms.corner, ...corner);
     for (const name of ["eye", "right", "down"]) gl.uniform3f(uniforms[name], ...c[name]);
@@ -68,7 +74,41 @@ const view = (() => {
     gl.uniform1f(uniforms.detail, MATERIAL.leveled ? state.detail : 0);
     gl.uniform1f(uniforms.exposure, state.exposure);
     gl.uniform2f(uniforms.grid, ...MATERIAL.grid);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    if (!meshed) return gl.drawArrays(gl.TRIANGLES, 0, 3);
+    const grey = show === 0 ? 0.461 : 0;
+    gl.clearColor(grey, grey, grey, show === 0 ? 1 : 0);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.enable(gl.DEPTH_TEST);
+    gl.drawArrays(gl.TRIANGLES, 0, mesh.count);
+    gl.disable(gl.DEPTH_TEST);
+  }
+
+  // Takes an OBJ's text, or says why not.
+  function take(text, name) {
+    try {
+      const numbers = meshOf(text), vertices = gl.createVertexArray();
+      mesh ??= linked(MATERIAL.fragment.replace("\n", "\n#define BTFKIT_MESH\n"), MESH_VERTEX);
+      gl.bindVertexArray(vertices);
+      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ARRAY_BUFFER, numbers, gl.STATIC_DRAW);
+      [3, 3, 2, 3, 3, 3].reduce((at, size, k) => {
+        gl.enableVertexAttribArray(k);
+        gl.vertexAttribPointer(k, size, gl.FLOAT, false, 68, 4 * at);
+        return at + size;
+      }, 0);
+      Object.assign(mesh, {vertices, count: numbers.length / 17, name});
+      state.pair = -1;
+      set("shape", "mesh");
+      rows(by("numbers"), [["mesh", `${name}: ${mesh.count / 3} triangles`]]);
+    } catch (error) {
+      rows(by("numbers"), [["mesh", `${name}: ${error.message}`]]);
+    }
+  }
+  function linked(fragment, vertex) {
+    const program = btfkitProgram(gl, fragment, vertex);
+    gl.useProgram(program);
+    btfkitBind(gl, program, made);
+    return {program, vertices: null, uniforms: new Proxy({}, {get: (known, name) => known[name] ??= gl.getUniformLocation(program, name)})};
   }
 
   // Numbers behind pixels: 1 uv, footprint, whether the shape is hit; 2 light in the surface's
@@ -80,12 +120,17 @@ const view = (() => {
     gl.renderbufferStorage(gl.RENDERBUFFER, gl.RGBA32F, ...size);
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
     gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER, target);
+    const depth = gl.createRenderbuffer();
+    gl.bindRenderbuffer(gl.RENDERBUFFER, depth);
+    gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, ...size);
+    gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, depth);
     gl.viewport(0, 0, ...size);
-    draw(show, w, h, at);
+    draw(show, w, h, at, size);
     gl.readPixels(0, 0, ...size, gl.RGBA, gl.FLOAT, found);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.deleteFramebuffer(frame);
     gl.deleteRenderbuffer(target);
+    gl.deleteRenderbuffer(depth);
     return found;
   }
 
@@ -287,6 +332,10 @@ const view = (() => {
     by("exposure").oninput = (e) => set("exposure", Number(e.target.value));
     by("detail").onchange = (e) => set("detail", Number(e.target.checked));
     by("reset").onclick = reset;
+    const file = (found) => { if (found) found.text().then((text) => take(text, found.name)); };
+    by("file").onchange = (e) => file(e.target.files[0]);
+    for (const name of ["dragover", "drop"]) document.addEventListener(name, (e) => e.preventDefault());
+    document.addEventListener("drop", (e) => file(e.dataTransfer.files[0]));
     by("pair").onchange = (e) => set("pair", Number(e.target.value));
     by("split").oninput = (e) => set("split", Number(e.target.value));
     const radios = (id, names, choose) => by(id).append(...names.map(([name, shown]) => {
@@ -314,14 +363,13 @@ const view = (() => {
     const needed = Math.max(MATERIAL.textures.size[1], MATERIAL.textures.size[2]), most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     if (needed > most) return fail(`The material has textures of ${needed} texels a side; this graphics card takes ${most}.`);
     floats = gl.getExtension("EXT_color_buffer_float");
+    const data = Object.fromEntries(Object.entries(MATERIAL.data).map(([name, text]) => [name, btfkitBytes(text)]));
+    made = btfkitTextures(gl, MATERIAL.textures, data);
     try {
-      program = btfkitProgram(gl, MATERIAL.fragment);
+      flat = linked(MATERIAL.fragment);
     } catch (error) {
       return fail(`The material's shader was refused:\n\n${error.message}`);
     }
-    uniforms = new Proxy({}, {get: (known, name) => known[name] ??= gl.getUniformLocation(program, name)});
-    const data = Object.fromEntries(Object.entries(MATERIAL.data).map(([name, text]) => [name, btfkitBytes(text)]));
-    btfkitBind(gl, program, btfkitTextures(gl, MATERIAL.textures, data));
     rows(by("about"), MATERIAL.about);
     if (MEASURED) {
       MEASURED.bytes = new Uint8Array(btfkitBytes(MEASURED.codes));
@@ -334,5 +382,5 @@ const view = (() => {
   }
   Object.assign(state, START);
   start();
-  return {state, read, under, paint, timed, pixelShown, measuredAt};
+  return {state, read, under, paint, timed, pixelShown, measuredAt, take};
 })();
