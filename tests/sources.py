@@ -209,6 +209,25 @@ def _rgl(folder: Path) -> Path:
     return folder / "paper_rgb.bsdf"
 
 
+def _ptm(folder: Path) -> Path:
+    rng = np.random.default_rng(0)
+    h, w = SIZE
+    head = f"PTM_1.2\nPTM_FORMAT_LRGB\n{w}\n{h}\n1.5 1 1 2 1 2\n120 130 125 128 127 0\n"
+    body = rng.integers(0, 256, 9 * h * w, dtype=np.uint8)
+    (folder / "coin.ptm").write_bytes(head.encode() + body.tobytes())
+    return folder / "coin.ptm"
+
+
+def _hsh(folder: Path) -> Path:
+    rng = np.random.default_rng(0)
+    h, w = SIZE
+    head = f"#HSH1.2\r\n3\r\n{w} {h} 3\r\n9 2 1\r\n".encode()
+    table = rng.uniform(0.1, 0.5, (2, 9)).astype("<f4").tobytes()
+    body = rng.integers(0, 256, 27 * h * w, dtype=np.uint8).tobytes()
+    (folder / "coin.rti").write_bytes(head + table + body)
+    return folder / "coin.rti"
+
+
 def _hdf5(folder: Path) -> Path:
     import h5py
 
@@ -236,6 +255,8 @@ SOURCES: dict[str, Callable[[Path], Path]] = {
     "bonn": _bonn,
     "utia_brdf": _utia_brdf,
     "hdf5": _hdf5,
+    "ptm": _ptm,
+    "hsh": _hsh,
 }
 # Folders of images: each may as well come as a zip.
 FOLDERS = ("manifest", "spectral", "ubo2003", "utia", "materialgan", "diligent", "lp")

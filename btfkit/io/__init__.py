@@ -33,6 +33,8 @@ FORMATS: dict[str, str] = {
     "bonn": "btfkit.io.bonn.reader",
     "utia_brdf": "btfkit.io.utia_brdf",
     "hdf5": "btfkit.io.hdf5",
+    "ptm": "btfkit.io.ptm",
+    "hsh": "btfkit.io.hsh",
 }
 
 
