@@ -81,14 +81,18 @@ def cells_of(
 
     Args:
         material: its name. models, budgets, seed: of the profile.
-        rows: of the data's grid; None leaves out what is smaller or coarser than the data.
+        rows: of the data's grid; None where queries do not say.
         pictured: whether the data are pictures; models that need some refuse queries only once.
-        gains: whether models that can find gains are run once more to do so.
+        gains: whether some models that can find gains are run once more to do so, and variants
+            that are smaller or coarser are left out.
     """
     found = []
     wanted = tuple(budgets)
     for model in models:
-        variants = list(_variants(model, None if gains else rows, pictured=pictured))
+        variants = list(_variants(model, rows, pictured=pictured))
+        if gains:
+            # Smaller and coarser models are told apart by traced materials.
+            variants = [each for each in variants if not {"size", "precision"} & each.keys()]
         if gains and pictured and model in _GAINED:
             variants.append({"gains": "true"})
         for settings in variants:
@@ -113,9 +117,8 @@ def _variants(model: str, rows: int | None, *, pictured: bool) -> tuple[dict[str
     if model == "pca" and pictured:
         return tuple({"rank": str(rank)} for rank in (1, 2, 4, 8, 16, 32))
     if model == "neumip":
-        if not rows:
-            return ({}, {"offset": "0"})
-        return ({}, {"offset": "0"}, {"size": str(max(rows // 2, 1))}, {"precision": "int8"})
+        smaller = ({"size": str(max(rows // 2, 1))},) if rows else ()
+        return ({}, {"offset": "0"}, *smaller, {"precision": "int8"})
     return ({},)
 
 
