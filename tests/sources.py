@@ -228,6 +228,13 @@ def _hsh(folder: Path) -> Path:
     return folder / "coin.rti"
 
 
+def _bme(folder: Path) -> Path:
+    head = '#sample_name "paper"\n#format: theta phi BRDF\n#intheta 40\n#inphi 30\n'
+    rows = [f"{5 + 20 * i} {90 * i} {0.1 + 0.02 * i}\n" for i in range(PAIRS)]
+    (folder / "paper.txt").write_text(head + "".join(rows))
+    return folder / "paper.txt"
+
+
 def _hdf5(folder: Path) -> Path:
     import h5py
 
@@ -257,6 +264,7 @@ SOURCES: dict[str, Callable[[Path], Path]] = {
     "hdf5": _hdf5,
     "ptm": _ptm,
     "hsh": _hsh,
+    "bme": _bme,
 }
 # Folders of images: each may as well come as a zip.
 FOLDERS = ("manifest", "spectral", "ubo2003", "utia", "materialgan", "diligent", "lp")

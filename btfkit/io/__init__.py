@@ -35,6 +35,7 @@ FORMATS: dict[str, str] = {
     "hdf5": "btfkit.io.hdf5",
     "ptm": "btfkit.io.ptm",
     "hsh": "btfkit.io.hsh",
+    "bme": "btfkit.io.bme",
 }
 
 
