@@ -209,6 +209,32 @@ def _rgl(folder: Path) -> Path:
     return folder / "paper_rgb.bsdf"
 
 
+def _ptm(folder: Path) -> Path:
+    rng = np.random.default_rng(0)
+    h, w = SIZE
+    head = f"PTM_1.2\nPTM_FORMAT_LRGB\n{w}\n{h}\n1.5 1 1 2 1 2\n120 130 125 128 127 0\n"
+    body = rng.integers(0, 256, 9 * h * w, dtype=np.uint8)
+    (folder / "coin.ptm").write_bytes(head.encode() + body.tobytes())
+    return folder / "coin.ptm"
+
+
+def _hsh(folder: Path) -> Path:
+    rng = np.random.default_rng(0)
+    h, w = SIZE
+    head = f"#HSH1.2\r\n3\r\n{w} {h} 3\r\n9 2 1\r\n".encode()
+    table = rng.uniform(0.1, 0.5, (2, 9)).astype("<f4").tobytes()
+    body = rng.integers(0, 256, 27 * h * w, dtype=np.uint8).tobytes()
+    (folder / "coin.rti").write_bytes(head + table + body)
+    return folder / "coin.rti"
+
+
+def _bme(folder: Path) -> Path:
+    head = '#sample_name "paper"\n#format: theta phi BRDF\n#intheta 40\n#inphi 30\n'
+    rows = [f"{5 + 20 * i} {90 * i} {0.1 + 0.02 * i}\n" for i in range(PAIRS)]
+    (folder / "paper.txt").write_text(head + "".join(rows))
+    return folder / "paper.txt"
+
+
 def _hdf5(folder: Path) -> Path:
     import h5py
 
@@ -236,6 +262,9 @@ SOURCES: dict[str, Callable[[Path], Path]] = {
     "bonn": _bonn,
     "utia_brdf": _utia_brdf,
     "hdf5": _hdf5,
+    "ptm": _ptm,
+    "hsh": _hsh,
+    "bme": _bme,
 }
 # Folders of images: each may as well come as a zip.
 FOLDERS = ("manifest", "spectral", "ubo2003", "utia", "materialgan", "diligent", "lp")

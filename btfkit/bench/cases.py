@@ -124,7 +124,8 @@ def stratified(path: Path, *, holdout: float, seed: int) -> Case:
     angle = strata.angles(btf.light[test], btf.view[test], btf.light[train], btf.view[train])
     shown = strata.shown(angle, each=_PICTURES, seed=seed)
     case = _case(name_of(path), btf.subset(train), btf.subset(test[shown]))
-    return replace(case, angle=angle[shown])
+    # Levels of detail are for traced materials, of which each level is known.
+    return replace(case, angle=angle[shown], coarse=())
 
 
 def asked(path: Path, *, holdout: float, seed: int) -> Case:

@@ -83,12 +83,16 @@ def cells_of(
         material: its name. models, budgets, seed: of the profile.
         rows: of the data's grid; None where queries do not say.
         pictured: whether the data are pictures; models that need some refuse queries only once.
-        gains: whether models that can find gains are run once more to do so.
+        gains: whether some models that can find gains are run once more to do so, and variants
+            that are smaller or coarser are left out.
     """
     found = []
     wanted = tuple(budgets)
     for model in models:
         variants = list(_variants(model, rows, pictured=pictured))
+        if gains:
+            # Smaller and coarser models are told apart by traced materials.
+            variants = [each for each in variants if not {"size", "precision"} & each.keys()]
         if gains and pictured and model in _GAINED:
             variants.append({"gains": "true"})
         for settings in variants:
@@ -121,14 +125,16 @@ def _variants(model: str, rows: int | None, *, pictured: bool) -> tuple[dict[str
 def run_cell(cell: Cell, case: Case) -> dict[str, Any]:
     """Fit, then measure: what `docs/benchmarks.md` lists, as JSON types."""
     with measures.peak_memory() as memory:
+        stated: Mapping[str, Any] = {}
         if cell.model in CLOSED_FORM:
-            material, ran = _closed_form(cell, case)
+            material, ran, stated = _closed_form(cell, case)
         else:
             trainable, generators = _trainable(cell, [case])
             budget = cell.budget_cpu_s or 1.0
             ran = _train(trainable, generators, budget, lambda m: measures.look(m, case))
-            material = trainable.material()
-    return _row(cell, case, material, ran, memory)
+            material, stated = trainable.material(), trainable.stated()
+    found = {"gains": stated["gains"]} if "gains" in stated else {}
+    return {**_row(cell, case, material, ran, memory), **found}
 
 
 def run_together(cells: Sequence[Cell], cases: Sequence[Case]) -> list[dict[str, Any]]:
@@ -189,11 +195,11 @@ def _head(cell: Cell) -> dict[str, Any]:
     }
 
 
-def _closed_form(cell: Cell, case: Case) -> tuple[Material, _Ran]:
+def _closed_form(cell: Cell, case: Case) -> tuple[Material, _Ran, Mapping[str, Any]]:
     start, cpu = time.perf_counter(), time.process_time()
-    material, _ = closed_form(case.train, cell.model, cell.settings, seed=cell.seed)
+    material, found = closed_form(case.train, cell.model, cell.settings, seed=cell.seed)
     spent = time.perf_counter() - start, time.process_time() - cpu
-    return material, _Ran(*spent, 1, case.samples)
+    return material, _Ran(*spent, 1, case.samples), found.stated() if found else {}
 
 
 def _trainable(cell: Cell, cases: Sequence[Case]) -> tuple[Any, Any]:

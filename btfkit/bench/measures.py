@@ -42,7 +42,7 @@ def errors(material: Material, case: Case) -> dict[str, Any]:
         else:
             pairs = range(len(case.pictures))
             found = by_picture([answer_pair(material, case.pictures, p) for p in pairs], case)
-        if material.has_levels:
+        if material.has_levels and case.angle is None:
             levels = errors_on_queries(material, case.queries).get("levels", [])
             pictured = {0: {key: found[key] for key in _PICTURED if key in found}}
             pictured |= {coarse.level: _small_pictures(material, coarse) for coarse in case.coarse}
@@ -57,10 +57,9 @@ def by_picture(answers: Sequence[NDArray[np.float32]], case: Case) -> dict[str, 
     btf = case.pictures
     if btf is None:
         raise ValueError(f"{case.name} has queries, and no pictures to compare with")
-    found = errors_of_pictures(answers, btf)
     if case.angle is None:
-        return found
-    each = []
+        return errors_of_pictures(answers, btf)
+    each, together, seen = [], metrics.Pooled(), metrics.Pooled()
     tilts = [directions.to_angles(d)[0] for d in (btf.light, btf.view)]
     for pair, answer in enumerate(answers):
         truth = btf.texture(pair)
@@ -69,14 +68,24 @@ def by_picture(answers: Sequence[NDArray[np.float32]], case: Case) -> dict[str, 
         one: dict[str, Any] = {"angle_deg": float(case.angle[pair])}
         for name, tilt in zip(("light_deg", "view_deg"), tilts, strict=True):
             one[name] = float(np.degrees(tilt[pair]))
-        for suffix, given in (("", answer), ("_gains", gains.crossed(answer, truth))):
+        with_gains = gains.crossed(answer, truth)
+        for suffix, given, all_of in (("", answer, together), ("_gains", with_gains, seen)):
             pooled, pictured = metrics.Pooled(), metrics.Pictured()
-            pooled.add(given, truth)
+            for sums in (pooled, all_of):
+                sums.add(given, truth)
             pictured.add(given, truth)
             errors = {**pooled.errors(), **pictured.errors()}
             one |= {f"{key}{suffix}": errors[key] for key in _EACH if key in errors}
         each.append(one)
-    return {**found, "each": each}
+    found = {**together.errors(), **_means(each, "")}
+    apart = {**seen.errors(), **_means(each, "_gains")}
+    return {**found, **{f"{key}_gains": value for key, value in apart.items()}, "each": each}
+
+
+def _means(each: Sequence[dict[str, Any]], suffix: str) -> dict[str, float]:
+    """Means over pictures of what is defined on whole ones."""
+    keys = [key for key in ("ssim_srgb", "flip") if key + suffix in each[0]]
+    return {key: float(np.mean([one[key + suffix] for one in each])) for key in keys}
 
 
 _EACH = ("mse", "mse_log1p", "ssim_srgb", "flip")

@@ -75,6 +75,7 @@ def page(results: Mapping[str, Any]) -> str:
         parts.append(f"## {material}\n")
         if good:
             parts += [_about(good[0]), _table_of(good), _gains(good)]
+        parts += [_found(row) for row in good if "gains" in row]
         for row in here:
             if "failed" in row:
                 parts.append(f"`{row['label']}`: {row['failed']}\n")
@@ -135,6 +136,19 @@ def _gains(rows: Sequence[Row]) -> str:
     return (
         "A gain for each held-out pair and channel taken out, estimated on one half of its texels "
         "and scored on the other:\n\n" + tables.table(head, lines)
+    )
+
+
+def _found(row: Row) -> str:
+    """What gains a fit found, in words."""
+    found = row["gains"]
+    spread, smooth = (
+        ", ".join(f"{100 * part:.1f}" for part in found[key]) for key in ("deviation", "smooth")
+    )
+    error = "" if found["error"] is None else f", each known to {100 * found['error']:.1f} %"
+    return (
+        f"`{row['label']}`: the gains of {found['pairs']} pairs vary by {spread} %{error}; "
+        f"{smooth} % change slowly with light and view and stay in the reflectance.\n"
     )
 
 

@@ -106,7 +106,8 @@ def fit(
         said = f"starting took {phases.seconds['starting']:.0f} s of a budget of {budget_s:g} s"
         choice = (*choice, f"{said}: training had its least share, and ended late")
     if _cpu_alone(chosen, run.device, device):
-        choice = (*choice, f"trained on the CPU: {chosen} cannot use a GPU")
+        what = f"{chosen} with gains" if truth("gains", given.get("gains", "false")) else chosen
+        choice = (*choice, f"trained on the CPU: {what} cannot use a GPU")
     provenance = _provenance(data, plan, given, run)
     if teacher is not None:
         of = {"model": teacher.model, "provenance": dict(teacher.header.provenance)}

@@ -34,6 +34,9 @@ FORMATS: dict[str, str] = {
     "bonn": "btfkit.io.bonn.reader",
     "utia_brdf": "btfkit.io.utia_brdf",
     "hdf5": "btfkit.io.hdf5",
+    "ptm": "btfkit.io.ptm",
+    "hsh": "btfkit.io.hsh",
+    "bme": "btfkit.io.bme",
 }
 
 

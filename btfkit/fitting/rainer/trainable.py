@@ -115,7 +115,11 @@ class _Rainer(Trainable):
             )
         arrays = file.training_arrays(path)
         self.encoder.load_state_dict(
-            {k.removeprefix("encoder."): torch.from_numpy(v.copy()) for k, v in arrays.items()}
+            {
+                name.removeprefix("encoder."): torch.from_numpy(value.copy())
+                for name, value in arrays.items()
+                if name.startswith("encoder.")
+            }
         )
         for name, tensor in self.decoder.arrays().items():
             tensor.copy_(torch.from_numpy(np.array(fitted.weights[name])))
