@@ -15,6 +15,7 @@ from btfkit.cli.outcome import Outcome, verb
 @verb(
     "bench",
     example="""btfkit bench cobbles wool.btf.zarr --model neumip --model pca --quick
+btfkit bench merge bundle rectify -o stages
 btfkit bench wool.btf.zarr --questions && btfkit bench wool.btf.zarr --answers ours=answers.npz""",
 )
 @click.argument("names", nargs=-1)
@@ -50,20 +51,26 @@ def bench_verb(
     """Fit models to materials within budgets, and write what each cost and how far off it is.
 
     NAMES: materials of `btfkit synth --list`, or stores, query files and whatever else `ingest`
-    reads. Writes bench.json, tables (bench.md, bench.csv, bench.tex) and two plots of all that
-    the folder holds: what former calls finished is kept and told with the rest, so that models,
-    budgets and materials may be run one after the other, or by several processes at a time.
+    reads; merge, bundle and rectify measure those stages of a calibration by themselves. Writes
+    bench.json, tables (bench.md, bench.csv, bench.tex) and two plots of all that the folder holds:
+    what former calls finished is kept and told with the rest, so that models, budgets and
+    materials may be run one after the other, or by several processes at a time.
 
     Your own method: --questions writes FOLDER/questions/NAME.npz (uv, light, view); add rgb to each
     and name them with --answers. Without --model nothing is fitted then.
     """
     from btfkit.bench.run import QUICK, Profile, ask, run
-    from btfkit.bench.tables import brief
+    from btfkit.bench.stages import STAGES
+    from btfkit.bench.tables import brief, stages
     from btfkit.errors import meaning
     from btfkit.relief.procedural import CATALOGUE
 
     profile = QUICK if quick else Profile()
-    if names:
+    profile = replace(profile, stages=tuple(name for name in names if name in STAGES))
+    if profile.stages and set(names) <= set(STAGES):
+        profile = replace(profile, materials=(), models=(), kernel_seconds=0.0)
+    elif names:
+        names = tuple(name for name in names if name not in STAGES)
         stores = tuple(Path(name) for name in names if name not in CATALOGUE)
         for path in stores:
             if not path.exists():
@@ -93,7 +100,9 @@ def bench_verb(
         return Outcome("\n".join(map(str, asked)), {"questions": asked})
     found = run(profile, folder, progress=bar)
     files = [folder / name for name in FILES]
-    line = f"{folder}: {len(found['cells'])} cells\n\n{brief(found['cells'])}"
+    told = [brief(found["cells"])] if found["cells"] else []
+    told += stages({name: found["stages"][name] for name in profile.stages})
+    line = f"{folder}: {len(found['cells'])} cells\n\n" + "\n".join(told)
     then = f"open {folder / 'bench.md'}; a method of your own: --questions, then --answers"
     return Outcome(line, {**found, "files": files}, then=then)
 
