@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from btfkit.conventions import (
     EPSILON,
     LEAK,
+    LEAST_FACING,
     LEVELS_UNIT,
     LOOKS,
     LOWEST_COSINE,
@@ -20,7 +21,7 @@ from btfkit.conventions import (
 )
 from btfkit.export.arrays import narrowed
 from btfkit.export.numbers import literal
-from btfkit.export.sections import filled, sections
+from btfkit.export.sections import filled, sections, whole_text
 from btfkit.materials.base import Material
 from btfkit.native.neural.plain import YUV_TO_RGB
 from btfkit.program import Dense, DepthNetwork, Heights, Program, Texture
@@ -41,10 +42,17 @@ _INPUTS = {
 
 
 def write(material: Material, program: Program, folder: Path) -> None:
-    """`material.hpp`, `material.bin` and `example.cpp`."""
+    """`material.hpp`, `material.bin`, `lobes.hpp` and `example.cpp`."""
     header, numbers = source(program, model=material.model, texel_mm=material.header.texel_mm)
     (folder / "material.hpp").write_text(header)
     (folder / "material.bin").write_bytes(numbers)
+    rows, columns = material.lobes.levels[0].shape[:2]
+    into = "{0} - std::floor({0})" if program.wrap else "std::clamp({0}, 0.0, 1.0)"
+    lobes = filled(
+        whole_text("lobes.hpp.txt"), h=rows, w=columns, facing=LEAST_FACING,
+        reduced_u=into.format("u"), reduced_v=into.format("v"),
+    )  # fmt: skip
+    (folder / "lobes.hpp").write_text(lobes)
     example = sections("material.hpp.txt")["example"]
     (folder / "example.cpp").write_text(filled(example, space=SPACE))
 

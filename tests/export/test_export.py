@@ -387,3 +387,44 @@ def test_the_lobes_of_an_export_draw_as_the_material(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         lobes.pdf(place, light, view), material.pdf(uv, light, view), rtol=1e-6
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["neumip", "neumip-clamped"])
+def test_lobes_in_cpp_draw_as_the_material(name: str, tmp_path: Path) -> None:
+    compiler = shutil.which("g++") or shutil.which("c++")
+    if compiler is None:
+        needs.lacking("g++", "apt-get install g++")
+    material, rng, n = made(name), np.random.default_rng(7), 300
+    export(material, "cpp", tmp_path / "out")
+    view, light = directions(rng, n), directions(rng, n)
+    uv, numbers = rng.uniform(-1, 2, (n, 2)), rng.random((n, 3), np.float32)
+    inside = uv - np.floor(uv) if material.header.wrap == "wrap" else np.clip(uv, 0, 1)
+    place = seen_at(material, inside, view).astype(np.float32)
+    (tmp_path / "main.cpp").write_text("""
+#include <cstdio>
+#include "out/lobes.hpp"
+int main() {
+  const btfkit_material::Lobes lobes("out/lobes.bin");
+  float q[11];
+  while (std::fread(q, 4, 11, stdin) == 11) {
+    const auto drawn = lobes.sample(q[0], q[1], q + 2, q + 8);
+    const float found[5] = {drawn.light[0], drawn.light[1], drawn.light[2], drawn.pdf,
+                            lobes.pdf(q[0], q[1], q + 5, q + 2)};
+    std::fwrite(found, 4, 5, stdout);
+  }
+}
+""")
+    flags = ["-O1", "-std=c++17", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run([compiler, *flags, "main.cpp", "-o", "main"], cwd=tmp_path, check=True)
+    rows = np.column_stack([place, view, light, numbers]).astype("<f4")
+    done = subprocess.run(
+        [tmp_path / "main"], input=rows.tobytes(), cwd=tmp_path, check=True, capture_output=True
+    )
+    found = np.frombuffer(done.stdout, "<f4").reshape(n, 5)
+    drawn, density = material.sample(uv, view, numbers)
+    # float32 places near borders of cells may lie in their neighbours.
+    same = np.abs(found[:, 4] / material.pdf(uv, light, view) - 1) < 1e-3
+    assert same.mean() > 0.98
+    np.testing.assert_allclose(found[same, :3], drawn[same], atol=2e-5)
+    np.testing.assert_allclose(found[same, 3], density[same], rtol=2e-3)
