@@ -14,6 +14,7 @@ from btfkit.conventions import (
     CURVED_FINER,
     EPSILON,
     LEAK,
+    LEAST_FACING,
     LEVELS_UNIT,
     LOOKS,
     LOWEST_COSINE,
@@ -25,7 +26,7 @@ from btfkit.conventions import (
 )
 from btfkit.export.arrays import narrowed
 from btfkit.export.numbers import literal
-from btfkit.export.sections import filled, sections
+from btfkit.export.sections import filled, sections, whole_text
 from btfkit.materials.base import Material
 from btfkit.native.neural import bent
 from btfkit.native.neural.plain import YUV_TO_RGB
@@ -47,10 +48,17 @@ _INPUTS = {
 
 
 def write(material: Material, program: Program, folder: Path) -> None:
-    """`material.hpp`, `material.bin` and `example.cpp`."""
+    """`material.hpp`, `material.bin`, `lobes.hpp` and `example.cpp`."""
     header, numbers = source(program, model=material.model, texel_mm=material.header.texel_mm)
     (folder / "material.hpp").write_text(header)
     (folder / "material.bin").write_bytes(numbers)
+    rows, columns = material.lobes.levels[0].shape[:2]
+    into = "{0} - std::floor({0})" if program.wrap else "std::clamp({0}, 0.0, 1.0)"
+    lobes = filled(
+        whole_text("lobes.hpp.txt"), h=rows, w=columns, facing=LEAST_FACING,
+        reduced_u=into.format("u"), reduced_v=into.format("v"),
+    )  # fmt: skip
+    (folder / "lobes.hpp").write_text(lobes)
     example = sections("material.hpp.txt")["example"]
     (folder / "example.cpp").write_text(filled(example, space=SPACE, **_curvature(program)))
 

@@ -7,7 +7,6 @@ else: base colour in sRGB, all other numbers as they are.
 
 from __future__ import annotations
 
-import html
 import json
 from pathlib import Path
 
@@ -36,9 +35,7 @@ def write(material: Material, program: Program, folder: Path) -> None:
     header = material.header
     h, w = header.grid
     size = None if header.texel_mm is None else (w * header.texel_mm, h * header.texel_mm)
-    (folder / "material.mtlx").write_text(
-        materialx(set(shown), size_mm=size, wrap=header.wrap, licence=header.licence)
-    )
+    (folder / "material.mtlx").write_text(materialx(set(shown), size_mm=size, wrap=header.wrap))
     span = None if baked.height is None else float(np.ptp(baked.height))
     said = {
         "maps": {name: _MEANING[name] for name in shown},
@@ -90,14 +87,13 @@ def materialx(
     *,
     size_mm: tuple[float, float] | None,
     wrap: str,
-    licence: str | None,
     folder: str = "",
 ) -> str:
     """The text of a MaterialX file of an OpenPBR surface.
 
     Args:
         maps: which there are. size_mm: width and height of the tile, where known.
-        wrap: "wrap" or "clamp". licence: of the data.
+        wrap: "wrap" or "clamp".
         folder: before the names of the pictures.
     """
     mode = "periodic" if wrap == "wrap" else "clamp"
@@ -105,12 +101,10 @@ def materialx(
     inputs = {"base_color": "base_color", "metalness": "base_metalness",
               "specular_weight": "specular_weight", "roughness": "specular_roughness",
               "opacity": "geometry_opacity"}  # fmt: skip
-    notes = [f"licence: {licence}"] if licence else []
+    # What a file says of itself stays in JSON, where it is escaped.
+    about = "baked by btfkit"
     if size_mm:
-        notes.append(f"one tile is {size_mm[0]:g} mm x {size_mm[1]:g} mm")
-    # XML has no way to write most characters that control terminals.
-    said = "".join(c for c in "; ".join(["baked by btfkit", *notes]) if c.isprintable())
-    about = html.escape(said, quote=True)
+        about += f"; one tile is {size_mm[0]:g} mm x {size_mm[1]:g} mm"
     lines = [
         '<?xml version="1.0"?>',
         f'<materialx version="1.39" colorspace="lin_rec709" doc="{about}">',

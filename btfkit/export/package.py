@@ -11,8 +11,10 @@ from typing import Any
 
 from btfkit import jsonvalues
 from btfkit.btf import COLOUR
+from btfkit.conventions import LEAST_FACING
 from btfkit.export import ASKED, TARGETS
 from btfkit.export.arrays import refuse_unknown
+from btfkit.export.sections import filled, whole_text
 from btfkit.files import whole_folder
 from btfkit.materials.base import Material
 from btfkit.materials.lobes.table import COLUMNS
@@ -67,10 +69,12 @@ def export(
 
 
 def _lobes(material: Material, folder: Path) -> dict[str, Any]:
-    """Writes the lobes that lights are drawn from, and says how they lie in their file."""
+    """Writes what lights are drawn from and `lobes.py`, and says how it lies in its file."""
     finest = material.lobes.levels[0]
     h, w, _ = finest.shape
     (folder / LOBES).write_bytes(finest.astype("<f2").tobytes())
+    reader = filled(whole_text("lobes.py.txt"), facing=LEAST_FACING)
+    (folder / "lobes.py").write_text(reader)
     return {
         "file": LOBES,
         "size": [w, h],

@@ -9,6 +9,7 @@ import numpy as np
 
 from btfkit.materials.base import Header, Material
 from btfkit.materials.lambert import Lambert, LambertSpec
+from btfkit.materials.lobes import LobeTable
 from btfkit.materials.neubtf.paper import NeuBTFPaper, NeuBTFSpec
 from btfkit.materials.neumip.material import NeuMIP, NeuMIPPaper
 from btfkit.materials.neumip.spec import NeuMIPSpec
@@ -67,7 +68,9 @@ def made(name: str, *, seed: int = 0) -> Material:
             value += 1
         half = part.startswith("texture") and getattr(spec, "precision", "") == "float16"
         weights[part] = value.astype(np.float16 if half else np.float32)
-    return kind(spec, weights, header)
+    # Lobes that are not fitted each time a test exports: slopes, widths and shares of many kinds.
+    lobes = rng.uniform([-1, -1, 0.05, 0, 0], [1, 1, 0.9, 0.9, 0.9], (6, 9, 5)).astype(np.float16)
+    return kind(spec, weights, header).with_lobes(LobeTable.of(lobes, grid=GRID, wrap=wrap))
 
 
 def directions(rng: np.random.Generator, count: int, lowest: float = 0.02) -> np.ndarray:

@@ -362,6 +362,11 @@ value = bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0.6, 0.8))
 wanted = btfkit.load({str(tmp_path / "m.safetensors")!r}).evaluate([0.3, 0.4], [0, 0.6, 0.8], [0.6, 0, 0.8])
 assert max(abs(3.14159265 * a - b) for a, b in zip(value, wanted.reflectance)) < 1e-4
 assert sum(wanted.reflectance) > 0.1
+drawn, weight = bsdf.sample(mi.BSDFContext(), si, 0.3, [0.4, 0.6])
+density = bsdf.pdf(mi.BSDFContext(), si, drawn.wo)
+value = bsdf.eval(mi.BSDFContext(), si, drawn.wo)
+assert drawn.wo.z > 0 and abs(drawn.pdf - density) < 1e-4 * density
+assert max(abs(w * density - x) for w, x in zip(weight, value)) < 1e-4
 """
     subprocess.run([sys.executable, "-c", script], check=True)
 

@@ -128,6 +128,7 @@ def glossy_pdf(n: Floats, alpha: Floats, light: Floats, view: Floats) -> Floats:
     aside = np.square(np.cross(half, n)).sum(axis=1)
     facing = np.maximum((view * n).sum(axis=1), LEAST_FACING)
     square = alpha * alpha
-    spread = square / (np.pi * np.square(up * up * square + aside))
+    known = length > 1e-9
+    spread = square / (np.pi * np.square(np.where(known, up * up * square + aside, 1)))
     mask = 2 * (facing + np.sqrt(square + (1 - square) * facing * facing))
-    return np.where((up > 0) & (length > 1e-9), spread / mask, 0)
+    return np.where((up > 0) & known, spread / mask, 0)

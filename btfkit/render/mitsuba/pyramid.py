@@ -80,8 +80,7 @@ class Surface:
         h, w = heights.shape
         self._wrap, self._size = wrap, (w, h)
         # The cell at column x, row y lies between texels x - 1, x and y - 1, y.
-        mode = "wrap" if wrap else "edge"
-        p = np.pad(np.asarray(heights, np.float32), 1, mode=mode)
+        p = np.pad(np.asarray(heights, np.float32), 1, mode="wrap" if wrap else "edge")
         corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, :-1], p[1:, 1:]], axis=-1)
         self._corners = mi.Float(np.ascontiguousarray(corners).reshape(-1))
 
