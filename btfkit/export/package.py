@@ -52,7 +52,7 @@ def export(
     said = {"target": target, **about(material)}
     with whole_folder(out, force=force) as folder:
         write(material, program, folder)
-        if target not in ASKED:
+        if target != "mitsuba":  # there they lie in the model's file
             said["lobes"] = _lobes(material, folder)
         (folder / "about.json").write_text(json.dumps(jsonvalues.plain(said), indent=1) + "\n")
         (folder / PREVIEW).write_bytes(studio.picture(material))
