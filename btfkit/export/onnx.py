@@ -20,7 +20,7 @@ from btfkit.conventions import (
     MOST_LOG,
     STEEPEST,
 )
-from btfkit.export.arrays import narrowed
+from btfkit.export.arrays import narrowed, refuse_bent
 from btfkit.export.graph import IR_VERSION, OPSET, Graph, Value
 from btfkit.export.sections import filled, sections
 from btfkit.materials.base import Material
@@ -61,6 +61,8 @@ def built(program: Program, *, name: str, about: str) -> Any:
         name: of the graph. about: what the model carries as its metadata.
     """
     from onnx import TensorProto, helper, numpy_helper
+
+    refuse_bent(program, "onnx")
 
     graph = Graph()
     rgb, opacity = _answered(graph, program)

@@ -19,11 +19,12 @@ from cases import GRID, SPECS, directions, made
 
 from btfkit.cli import btfkit
 from btfkit.cli.outcome import run
-from btfkit.export import ASKED, TARGETS, exr, npz
+from btfkit.export import ASKED, TARGETS, exr, npz, three
 from btfkit.export.arrays import named, narrowed
 from btfkit.export.glsl.atlas import atlas, quantised
 from btfkit.export.package import export
 from btfkit.export.sections import filled
+from btfkit.export.shading import shaded
 from btfkit.io.images.exr import read_exr
 from btfkit.materials.base import Header, Material
 from btfkit.materials.file import save
@@ -260,8 +261,16 @@ def test_what_no_export_knows_is_refused_by_name(tmp_path: Path) -> None:
     from btfkit.export.arrays import refuse_unknown
 
     curved = Heights(np.zeros((2, 2), np.float32), 0.1, curved=True)
+    bends = replace(material.program(), depth=curved)
     with pytest.raises(TypeError, match="bends with curvature"):
-        refuse_unknown(replace(material.program(), depth=curved))
+        refuse_unknown(bends)
+    for target in ("wgsl", "slang"):
+        with pytest.raises(TypeError, match=f"{target} has no form here for rays that bend"):
+            shaded(bends, target, model="sbtf")
+    for writer in (exr, three):
+        with pytest.raises(TypeError, match="has no form here for rays that bend"):
+            writer.write(material, bends, tmp_path)
+    assert not list(tmp_path.iterdir())
     large = Lambert(
         LambertSpec((1, 8200)), {"texture": np.ones((1, 8200, 3), np.float32)}, Header((1, 8200))
     )
