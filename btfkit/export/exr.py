@@ -36,7 +36,7 @@ def write(material: Material, program: Program, folder: Path) -> None:
     ]
     if program.scaling:
         found["scaling"] = _texture(program.scaling, "scaling", folder)
-    if program.depth:
+    if isinstance(program.depth, (Heights, DepthNetwork)):
         found["depth"] = _depth(program.depth, folder)
     found["layers"] = [layer_described(layer) for layer in program.layers]
     (folder / "model.json").write_text(json.dumps(found, indent=1) + "\n")

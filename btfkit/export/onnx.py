@@ -196,6 +196,8 @@ class _Evaluation:
             along = self.view[0:2] / low * found.scale * flip
             lift = self.view[2:3].at_least(LOWEST_COSINE) / low * found.scale
             return self._crossing(found.heights, along) * lift
+        if not isinstance(found, DepthNetwork):
+            raise TypeError(f"{type(found).__name__} has no form in ONNX here")
         place = self._lookup(found.texture.levels[0], self.uv)
         known = self.known | self._columns(found.texture.features, place)
         return self._run(found.layers, found.inputs, known)[0:1] * found.scale
