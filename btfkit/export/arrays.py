@@ -67,6 +67,16 @@ def refuse_unknown(program: Program, target: str = "") -> None:
         )
 
 
+def refuse_bent(program: Program, target: str) -> None:
+    """TypeError for rays that bend and for networks of opacity and offset, in `target`."""
+    bent = isinstance(program.depth, Heights) and program.depth.curved
+    if bent or program.cover is not None or isinstance(program.depth, OffsetNetwork):
+        raise TypeError(
+            f"{target} has no form here for rays that bend with curvature, nor for networks of "
+            "opacity and offset; expected a material whose rays end on the plane's own heights"
+        )
+
+
 def _named(value: Any, name: str, arrays: dict[str, Array]) -> Any:
     if isinstance(value, np.ndarray):
         arrays[name] = narrowed(value)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.export.arrays import narrowed
+from btfkit.export.arrays import narrowed, refuse_bent
 from btfkit.export.npz import reader
 from btfkit.io.images.encoding import write_exr
 from btfkit.materials.base import Material
@@ -26,6 +26,7 @@ _LEFT = ("textures", "layers", "scaling", "depth", "heads")
 
 def write(material: Material, program: Program, folder: Path) -> None:
     """`model.json`, an EXR for each level of each texture, and `evaluate.py`."""
+    refuse_bent(program, "exr")
     found: dict[str, Any] = {"version": VERSION, "model": material.model}
     found |= {n: getattr(program, n) for n in program.__dataclass_fields__ if n not in _LEFT}
     found["heads"] = [{"kind": head.kind, "count": head.count} for head in program.heads]
@@ -35,7 +36,7 @@ def write(material: Material, program: Program, folder: Path) -> None:
     ]
     if program.scaling:
         found["scaling"] = _texture(program.scaling, "scaling", folder)
-    if program.depth:
+    if isinstance(program.depth, (Heights, DepthNetwork)):
         found["depth"] = _depth(program.depth, folder)
     found["layers"] = [layer_described(layer) for layer in program.layers]
     (folder / "model.json").write_text(json.dumps(found, indent=1) + "\n")

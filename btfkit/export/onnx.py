@@ -20,7 +20,7 @@ from btfkit.conventions import (
     MOST_LOG,
     STEEPEST,
 )
-from btfkit.export.arrays import narrowed
+from btfkit.export.arrays import narrowed, refuse_bent
 from btfkit.export.graph import IR_VERSION, OPSET, Graph, Value
 from btfkit.export.sections import filled, sections
 from btfkit.materials.base import Material
@@ -61,6 +61,8 @@ def built(program: Program, *, name: str, about: str) -> Any:
         name: of the graph. about: what the model carries as its metadata.
     """
     from onnx import TensorProto, helper, numpy_helper
+
+    refuse_bent(program, "onnx")
 
     graph = Graph()
     rgb, opacity = _answered(graph, program)
@@ -194,6 +196,8 @@ class _Evaluation:
             along = self.view[0:2] / low * found.scale * flip
             lift = self.view[2:3].at_least(LOWEST_COSINE) / low * found.scale
             return self._crossing(found.heights, along) * lift
+        if not isinstance(found, DepthNetwork):
+            raise TypeError(f"{type(found).__name__} has no form in ONNX here")
         place = self._lookup(found.texture.levels[0], self.uv)
         known = self.known | self._columns(found.texture.features, place)
         return self._run(found.layers, found.inputs, known)[0:1] * found.scale

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.conventions import EPSILON, LEAK, LOOKS, LOWEST_COSINE, STEEPEST
-from btfkit.export.arrays import narrowed
+from btfkit.export.arrays import narrowed, refuse_bent
 from btfkit.export.glsl.code import VECTORS, groups_of, reflectance, sources_of, variable
 from btfkit.export.glsl.layers import Source, Weights, arranged, component, grouped, padded
 from btfkit.export.numbers import literal
@@ -40,6 +40,7 @@ class Shaded:
 
 def shaded(program: Program, language: Language, *, model: str) -> Shaded:
     """The function of a program in a language, and its buffers."""
+    refuse_bent(program, language)
     return _Writer(program, language).written(model)
 
 

@@ -28,6 +28,8 @@ SPECS = {
     "neumip-clamped": (NeuMIP, NeuMIPSpec(GRID, levels=1, features=8, output="relu"), "clamp"),
     "neumip-paper": (NeuMIPPaper, NeuMIPSpec(GRID, levels=3, output="released"), "wrap"),
     # Sines of less than 2.5 times their sums: at random these double rounding layer by layer.
+    # Answers of 1e4 and more.
+    "bright": (NeuMIP, NeuMIPSpec(GRID, features=4, offset=0), "wrap"),
     "neubtf-paper": (NeuBTFPaper, NeuBTFSpec((16, 24), omega=1.25, parallax=True), "wrap"),
     "rainer20": (Rainer20, RainerSpec((8, 12), latents=32, whitened=True), "clamp"),
 }
@@ -48,7 +50,7 @@ BENT = {
 
 @cache
 def made(name: str, *, seed: int = 0) -> Material:
-    """The material of a case, its numbers random and such that answers are between 0 and 10."""
+    """The material of a case, its numbers random; answers are 0 to 10, of `bright` 1e3 and more."""
     kind, spec, wrap = {**SPECS, **BENT}[name]
     header = Header(grid=GRID, wrap=wrap, texel_mm=0.25, licence="CC0-1.0")
     rng = np.random.default_rng(seed)
@@ -66,6 +68,8 @@ def made(name: str, *, seed: int = 0) -> Material:
         if part == "renderer.out.bias":
             # Else most answers would be cut to 0.
             value += 1
+        if name == "bright" and part == "decoder.3.bias":
+            value += 9
         half = part.startswith("texture") and getattr(spec, "precision", "") == "float16"
         weights[part] = value.astype(np.float16 if half else np.float32)
     # Lobes that are not fitted each time a test exports: slopes, widths and shares of many kinds.

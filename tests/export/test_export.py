@@ -20,11 +20,12 @@ from cases import GRID, SPECS, directions, made
 
 from btfkit.cli import btfkit
 from btfkit.cli.outcome import run
-from btfkit.export import ASKED, TARGETS, blender, exr, npz
+from btfkit.export import ASKED, TARGETS, blender, exr, npz, three
 from btfkit.export.arrays import named, narrowed
 from btfkit.export.glsl.atlas import atlas, quantised
 from btfkit.export.package import export
 from btfkit.export.sections import filled
+from btfkit.export.shading import shaded
 from btfkit.io.images.exr import read_exr
 from btfkit.materials.base import Header, Material
 from btfkit.materials.file import save
@@ -188,7 +189,9 @@ def test_a_reader_has_the_parts_that_its_material_needs(tmp_path: Path) -> None:
     assert not any(part in sizes["lambert"] for part in ("crossing", "dense", "sigmoid", "disc"))
 
 
-@pytest.mark.parametrize("target", list(TARGETS))
+@pytest.mark.parametrize(
+    "target", [pytest.param(x, marks=pytest.mark.slow) if x in ASKED else x for x in TARGETS]
+)
 def test_papers_and_a_picture_travel_along(
     target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -263,8 +266,16 @@ def test_what_no_export_knows_is_refused_by_name(tmp_path: Path) -> None:
     from btfkit.export.arrays import refuse_unknown
 
     curved = Heights(np.zeros((2, 2), np.float32), 0.1, curved=True)
+    bends = replace(material.program(), depth=curved)
     with pytest.raises(TypeError, match="bends with curvature"):
-        refuse_unknown(replace(material.program(), depth=curved))
+        refuse_unknown(bends)
+    for target in ("wgsl", "slang"):
+        with pytest.raises(TypeError, match=f"{target} has no form here for rays that bend"):
+            shaded(bends, target, model="sbtf")
+    for writer in (exr, three):
+        with pytest.raises(TypeError, match="has no form here for rays that bend"):
+            writer.write(material, bends, tmp_path)
+    assert not list(tmp_path.iterdir())
     large = Lambert(
         LambertSpec((1, 8200)), {"texture": np.ones((1, 8200, 3), np.float32)}, Header((1, 8200))
     )
@@ -303,8 +314,8 @@ def test_names_of_a_file_never_become_part_of_a_program(tmp_path: Path) -> None:
     assert result["licence"] == " ".join(HOSTILE)
     assert json.loads((tmp_path / "whole" / "about.json").read_text())["channels"] == list(HOSTILE)
     for target, home in TARGETS.items():
-        if target in ("onnx", "mitsuba"):
-            # Metadata of a graph and of a model file; no text of theirs is a program's.
+        if target in ("onnx", *ASKED):
+            # Metadata of a graph; and what is made by other programs' own writers.
             continue
         module, function = home.split(":")
         (tmp_path / target).mkdir()

@@ -154,7 +154,7 @@ def test_the_page_shows_a_ball_and_says_nothing_in_the_console(
 def test_the_page_draws_what_the_material_answers(name: str, modules: Path, tmp_path: Path) -> None:
     out = exported(name, modules, tmp_path / "out")
     page = out / "index.html"
-    assert len(page.read_text().splitlines()) <= 55
+    assert len(page.read_text().splitlines()) <= 40
     assert not re.search(r"https?://", page.read_text() + (out / "btfkit.js").read_text())
     values = {"eye": list(EYE), "light": ", ".join(map(str, LIGHT)), "size": SIZE}
     (out / "look.html").write_text(page.read_text() + _LOOK % values)

@@ -33,8 +33,8 @@ class Pairs(NamedTuple):
 class Lessons(Source):
     """Random places and directions, answered by the teacher.
 
-    Half of the directions are those of the data where there are some, each moved by a few
-    degrees, so that what lies between is learnt, too; the others are drawn over the hemisphere.
+    Three quarters of the directions are those of the data where there are some, each moved by a
+    few degrees, so that what lies between is learnt, too; the others are drawn over the hemisphere.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Lessons(Source):
         uv = rng.random((count, 2), np.float32)
         light, view = over_hemisphere(rng, count), over_hemisphere(rng, count)
         if self._pairs is not None:
-            some = rng.integers(len(self._pairs.light), size=count // 2)
+            some = rng.integers(len(self._pairs.light), size=count * 3 // 4)
             for way, known in ((light, self._pairs.light), (view, self._pairs.view)):
                 way[: len(some)] = moved(rng, known[some])
         footprint = None

@@ -19,7 +19,6 @@ class Settings(Stepped):
     """
 
     width: int = 16
-    inputs: str = "half"
     depth_width: int = 8
 
     def __post_init__(self) -> None:

@@ -23,7 +23,7 @@ from btfkit.fitting.neumip.settings import INPUTS
 from btfkit.fitting.neumip.trainable import Marching
 from btfkit.fitting.student.lessons import Lessons, pairs_of
 from btfkit.fitting.student.settings import Settings
-from btfkit.footprint import blur_of, gaussian, most_levels
+from btfkit.footprint import FINEST, blur_of, gaussian, most_levels
 from btfkit.materials import PROGRAMS
 from btfkit.materials.base import Header, Material
 from btfkit.materials.neumip import material as evaluated
@@ -33,8 +33,8 @@ from btfkit.program import Heights, Program
 from btfkit.queries import QuerySet
 
 _LAYERS = 2
-# Of the texture of the depth network: a height and its slopes.
-_DEPTH_CHANNELS = 3
+# Of the texture of the depth network: a height and its slopes, twice; the footprint of the second.
+_DEPTH_CHANNELS, _LARGE = 6, 2.0
 
 
 @final
@@ -154,10 +154,17 @@ class Student(Marching[Settings]):
         return taken
 
     def _relief(self, heights: NDArray[Any]) -> NDArray[Any]:
-        """(h, w, 3) heights, and how they change along u and v, of a like size."""
-        across, down = (np.gradient(heights, axis=axis) for axis in (1, 0))
-        scale = np.std(heights) / max(np.std(across), np.std(down), 1e-6)
-        return np.stack([heights, across * scale, down * scale], axis=-1)
+        """(h, w, 6) heights and how they change along u and v, as they are and in the large."""
+        found = []
+        for blur in (FINEST, _LARGE):
+            matrices = (gaussian(n, blur_of(blur), wrap=self.layout.wrap) for n in heights.shape)
+            down, across = matrices
+            soft = down @ heights @ across.T
+            slopes = [np.gradient(soft, axis=axis) for axis in (1, 0)]
+            # Of a like size: what the layer takes is to begin alike.
+            scale = np.std(heights) / max(*(np.std(slope) for slope in slopes), 1e-6)
+            found += [soft, *(slope * scale for slope in slopes)]
+        return np.stack(found, axis=-1)
 
     def _pass_heights(self, weights: NDArray[Any]) -> None:
         """The depth network as one that answers the height itself, whatever the view."""
