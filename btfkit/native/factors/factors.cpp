@@ -20,6 +20,8 @@
 #include <immintrin.h>
 #endif
 
+#include "../wide.hpp"
+
 namespace factors {
 
 constexpr float kEpsilon = 1e-5f;
@@ -89,7 +91,7 @@ inline float widened(uint16_t half) {
 #define FACTORS_SPACE avx512
 #define FACTORS_LANES 16
 #define FACTORS_TARGET \
-    __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx2,fma,f16c,prefer-vector-width=512")))
+    __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx2,fma,f16c" WIDE)))
 #include "tile.hpp"
 #undef FACTORS_SPACE
 #undef FACTORS_LANES

@@ -23,6 +23,7 @@
 
 #include "../arrays.hpp"
 #include "../spread.hpp"
+#include "../wide.hpp"
 #include "blur.hpp"
 #include "plan.hpp"
 
@@ -40,7 +41,7 @@
 #define NEUMIP_SPACE avx512
 #define NEUMIP_LANES 16
 #define NEUMIP_TARGET \
-    __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx2,fma,prefer-vector-width=512")))
+    __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx2,fma" WIDE)))
 #include "variant.hpp"
 #undef NEUMIP_SPACE
 #undef NEUMIP_LANES
