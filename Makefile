@@ -28,6 +28,15 @@ campaign: $(STAMP)
 	PYTHONPATH=tests:tests/devices:tests/export OMP_NUM_THREADS=1 BTFKIT_THREADS=1 \
 	  $(BIN)/python -W ignore -m campaigns $(NAMES) --minutes $(or $(MINUTES),60)
 
+# Wheels for glibc 2.28 and later, and an sdist, checked: make wheel PYTHONS="python3.11 python3.12"
+wheel:
+	$(PYTHON) packaging/wheel.py $(PYTHONS)
+
+# The documentation as a site, in build/site; a warning is an error.
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[docs]"
+	$(BIN)/python -m mkdocs build
+
 bench: $(STAMP)
 	$(BIN)/btfkit bench
 

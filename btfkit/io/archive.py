@@ -236,6 +236,12 @@ class Archive:
             ) from error
         for info in members:
             plain = listing.zip_name(info).replace("\\", "/")
+            if plain.count("/") > listing.MOST_FOLDERS:
+                raise FormatError(
+                    self.path,
+                    f"member {plain!r} lies {plain.count('/')} folders deep; "
+                    f"expected {listing.MOST_FOLDERS} at most",
+                )
             name = PurePosixPath(plain)
             # ZipInfo.is_dir fails on an empty name.
             if plain[-1:] in ("", "/") or not spelling.all_count(name):

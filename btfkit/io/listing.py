@@ -10,6 +10,8 @@ from pathlib import Path, PurePosixPath
 from btfkit.io import spelling
 
 _BYTE_ORDER_MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+# Folders in folders that a member of a zip may lie in.
+MOST_FOLDERS = 32
 # General purpose bit 11 of a zip: names are UTF-8.
 _UTF8 = 1 << 11
 
@@ -22,6 +24,9 @@ def names_of(path: Path) -> list[str]:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as file:
                 names = [zip_name(info).replace("\\", "/") for info in file.infolist()]
+            # Every reader parses all of them: thousands that lie deep took minutes.
+            if max((name.count("/") for name in names), default=0) > MOST_FOLDERS:
+                return []
             return [name for name in names if spelling.all_count(PurePosixPath(name))]
     except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError):
         return []

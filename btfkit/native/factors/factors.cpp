@@ -20,6 +20,8 @@
 #include <immintrin.h>
 #endif
 
+#include "../processor.hpp"
+
 namespace factors {
 
 constexpr float kEpsilon = 1e-5f;
@@ -89,7 +91,7 @@ inline float widened(uint16_t half) {
 #define FACTORS_SPACE avx512
 #define FACTORS_LANES 16
 #define FACTORS_TARGET \
-    __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx2,fma,f16c,prefer-vector-width=512")))
+    __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx2,fma,f16c" WIDE)))
 #include "tile.hpp"
 #undef FACTORS_SPACE
 #undef FACTORS_LANES
@@ -138,10 +140,10 @@ std::vector<Variant> supported() {
     std::vector<Variant> found;
 #if defined(__x86_64__) && defined(__GNUC__)
     __builtin_cpu_init();
-    const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
-                      __builtin_cpu_supports("f16c");
-    if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw"))
+    const bool avx2 = CPU_SUPPORTS("avx2") && CPU_SUPPORTS("fma") &&
+                      CPU_SUPPORTS("f16c");
+    if (avx2 && CPU_SUPPORTS("avx512f") && CPU_SUPPORTS("avx512vl") &&
+        CPU_SUPPORTS("avx512dq") && CPU_SUPPORTS("avx512bw"))
         found.push_back(FACTORS_VARIANT(avx512));
     if (avx2) found.push_back(FACTORS_VARIANT(avx2));
 #endif

@@ -11,7 +11,8 @@
 #include "../arrays.hpp"
 #include "../spread.hpp"
 
-#if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GNUC__)
+// Clang reads the list otherwise, and some come without what chooses at run time.
+#if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GNUC__) && !defined(__clang__)
 #define CLONES __attribute__((target_clones("default", "avx2,fma")))
 #else
 #define CLONES

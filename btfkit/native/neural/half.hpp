@@ -27,7 +27,7 @@ typedef uint32_t PairRow __attribute__((may_alias));
 
 #if NEUMIP_LANES == 16 && (defined(__clang__) || __GNUC__ >= 10)
 #define HALF \
-    __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx512bf16,avx2,fma,prefer-vector-width=512")))
+    __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx512bf16,avx2,fma" WIDE)))
 
 // A matrix for `pair_gemm`: groups of six outputs, each group by pairs of inputs.
 struct Pairs {

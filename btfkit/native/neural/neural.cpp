@@ -23,6 +23,7 @@
 
 #include "../arrays.hpp"
 #include "../spread.hpp"
+#include "../processor.hpp"
 #include "blur.hpp"
 #include "plan.hpp"
 
@@ -40,7 +41,7 @@
 #define NEUMIP_SPACE avx512
 #define NEUMIP_LANES 16
 #define NEUMIP_TARGET \
-    __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx2,fma,prefer-vector-width=512")))
+    __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx2,fma" WIDE)))
 #include "variant.hpp"
 #undef NEUMIP_SPACE
 #undef NEUMIP_LANES
@@ -79,10 +80,10 @@ std::vector<Variant> supported() {
     std::vector<Variant> found;
 #if defined(__x86_64__) && defined(__GNUC__)
     __builtin_cpu_init();
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw"))
+    if (CPU_SUPPORTS("avx512f") && CPU_SUPPORTS("avx512vl") &&
+        CPU_SUPPORTS("avx512dq") && CPU_SUPPORTS("avx512bw"))
         found.push_back(NEUMIP_VARIANT(avx512));
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
+    if (CPU_SUPPORTS("avx2") && CPU_SUPPORTS("fma"))
         found.push_back(NEUMIP_VARIANT(avx2));
 #endif
     found.push_back(NEUMIP_VARIANT(baseline));
@@ -92,7 +93,7 @@ std::vector<Variant> supported() {
 bool multiplies_pairs() {
 #if defined(__x86_64__) && (defined(__clang__) || __GNUC__ >= 10)
     __builtin_cpu_init();
-    return __builtin_cpu_supports("avx512bf16");
+    return CPU_SUPPORTS("avx512bf16");
 #else
     return false;
 #endif

@@ -140,7 +140,11 @@ inline Hit march(const Relief& r, const Ray& ray, float most) {
       }
       i = wi, j = wj;
     }
+#if defined(__clang__)
+    const Pair other = __builtin_shufflevector(leave, leave, 1, 0, 2, 3);
+#else
     const Pair other = __builtin_shuffle(leave, Steps{1, 0, 2, 3});
+#endif
     const float t1 = std::min(std::min(leave[0], other[0]), most);
     if (base + (ahead * t1 + behind * t0) <= static_cast<float>(r.level[static_cast<size_t>(j) * r.w + i])) {
       const int ui = ti + cell[0], uj = tj + cell[1];

@@ -1,0 +1,112 @@
+"""What campaigns found, each as the smallest file that shows it."""
+
+from __future__ import annotations
+
+import io
+import struct
+import time
+import zipfile
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from btfkit.cli import btfkit as command
+from btfkit.cli.outcome import run
+from btfkit.errors import FormatError, one_line
+from btfkit.io import archive, detect, images, queryfile
+
+
+def _npy(header: str, body: bytes = b"") -> bytes:
+    head = header.encode("latin1") + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + body
+
+
+@pytest.mark.parametrize(
+    ("member", "data", "message"),
+    [
+        # numpy takes the memory before it looks for the numbers.
+        (
+            "uv.npy",
+            _npy("{'descr': '<f4', 'fortran_order': False, 'shape': (2000000000, 2)}"),
+            "holds less",
+        ),
+        (
+            "uv.npy",
+            _npy("{'descr': '<f4', 'fortran_order': False, 'shape': (2"),
+            "not a readable query file",
+        ),
+        (
+            "uv.npy",
+            _npy("{'descr': '|O', 'fortran_order': False, 'shape': (1, 2)}"),
+            "holds less|not a readable",
+        ),
+        # What is no array comes back from numpy as bytes.
+        ("uv.npy", b"no array at all", "not a readable query file"),
+    ],
+)
+def test_queries_whose_arrays_lie_are_refused_before_memory_is_taken(
+    member: str, data: bytes, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "q.npz"
+    up = np.tile(np.float32([0, 0, 1]), (2, 1))
+    np.savez(path, light=up, view=up)
+    with zipfile.ZipFile(path, "a") as file:
+        file.writestr(member, data)
+    with pytest.raises(FormatError, match=message):
+        queryfile.read(path)
+
+
+def test_a_profile_without_a_name_is_a_damaged_header() -> None:
+    data = cv2.imencode(".png", np.zeros((3, 4, 3), np.uint8))[1].tobytes()
+    chunk = b"iCCP" + b"x" * 5
+    profile = struct.pack(">I", 5) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    with pytest.raises(FormatError, match="the header is damaged"):
+        images.read("a.png", data[:33] + profile + data[33:], transfer="srgb")
+
+
+@pytest.mark.parametrize("offset", [0, 13, 10**9])
+def test_a_bmp_whose_pixels_lie_in_its_header_or_nowhere_is_refused(offset: int) -> None:
+    data = bytearray(cv2.imencode(".bmp", np.full((3, 4, 3), 90, np.uint8))[1].tobytes())
+    assert images.read("a.bmp", bytes(data), transfer="linear").shape == (3, 4, 3)
+    data[10:14] = struct.pack("<I", offset)
+    with pytest.raises(FormatError, match=f"pixels at byte {offset} of"):
+        images.read("a.bmp", bytes(data), transfer="linear")
+
+
+def test_a_zip_of_folders_in_folders_is_refused_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "deep.zip"
+    with zipfile.ZipFile(path, "w") as file:
+        for i in range(3000):
+            file.writestr(f"{'d/' * 90}{i}.png", b"")
+    start = time.process_time()
+    with pytest.raises(FormatError, match="no reader knows this file"):
+        detect(path)
+    with pytest.raises(FormatError, match="lies 90 folders deep; expected 32 at most"):
+        archive.Archive(path)
+    # Every reader parsed all names before: over a minute.
+    assert time.process_time() - start < 5
+
+
+def test_messages_are_one_printable_line_of_some_length() -> None:
+    said = str(FormatError("a\x1b[2J.exr", "channel '\x02':\nwidth \u202e8", remedy="save it"))
+    assert said == "a\\x1b[2J.exr: channel '\\x02': width \\u202e8; save it"
+    assert len(one_line("[" * 10000)) < 1000
+
+
+def test_a_name_cannot_speak_to_the_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "\x1b[2Jwool"
+    folder.mkdir()
+    for light in (10, 20):
+        picture = cv2.imencode(".png", np.full((3, 4, 3), light, np.uint8))[1].tobytes()
+        (folder / f"tl{light:03d}_pl000_tv000_pv000.png").write_bytes(picture)
+    assert run(command, ["ingest", str(folder), "--no-preview"]) == 0
+    said = capsys.readouterr()
+    assert "\x1b" not in said.out + said.err
+    assert "\\x1b[2Jwool" in said.out
+    assert io.StringIO(said.err).read().startswith("next: ")
