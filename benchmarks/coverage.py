@@ -52,6 +52,7 @@ def pairs_of(kind: str) -> tuple[Floats, Floats]:
 
 
 def in_memory(btf: BTF) -> Floats:
+    """Textures of all pairs."""
     return btf.textures.batch(range(len(btf)))
 
 
@@ -69,6 +70,7 @@ def truth(name: str) -> tuple[BTF, Floats]:
 
 
 def answers(material: Material, btf: BTF) -> Floats:
+    """(n, h, w, c) of a material for the pairs of a BTF."""
     uv = texel_centres(*btf.shape[1:3])
     each = [
         material.evaluate(uv, a, b).reflectance for a, b in zip(btf.light, btf.view, strict=True)
@@ -83,6 +85,7 @@ def decibels(found: Floats, true: Floats) -> Floats:
 
 
 def chroma(found: Floats, true: Floats) -> float:
+    """Mean largest difference of a channel's share of the sum."""
     sums = [v.sum(axis=-1, keepdims=True) for v in (found, true)]
     lit = (sums[0][..., 0] > 1e-3) & (sums[1][..., 0] > 1e-3)
     shares = [v / np.maximum(s, 1e-9) for v, s in zip((found, true), sums, strict=True)]
@@ -90,14 +93,16 @@ def chroma(found: Floats, true: Floats) -> float:
 
 
 def shown(name: str, found: Floats, true: Floats, beside: Floats | None, note: str = "") -> Floats:
+    """Print a row of a table; its decibels."""
     db = decibels(found, true)
-    worst = "" if beside is None else f" | {(db - beside).min():+.2f}"
+    gain = "" if beside is None else f"{(db - beside).min():+.2f}"
     cells = " | ".join(f"{value:.1f}" for value in db)
-    print(f"| {name} | {cells}{worst or ' | '} | {chroma(found, true):.3f} |{note}", flush=True)
+    print(f"| {name} | {cells} | {gain} | {chroma(found, true):.3f} |{note}", flush=True)
     return db
 
 
 def traced(args: argparse.Namespace, settings: dict[str, str]) -> None:
+    """Tables of traced materials."""
     for kind in args.sets:
         print(f"\n{kind} pairs\n\n| | 0-15 | -30 | -45 | -60 | -75 | -90 | least gain | chroma |")
         print("|---|---|---|---|---|---|---|---|---|")
@@ -122,6 +127,7 @@ def traced(args: argparse.Namespace, settings: dict[str, str]) -> None:
 
 
 def photographs(args: argparse.Namespace, settings: dict[str, str]) -> None:
+    """The table of photographs."""
     btf = btfkit.open(args.photographs)
     middle = [slice((n - args.size) // 2, (n + args.size) // 2) for n in btf.shape[1:3]]
     btf = btf.crop(*middle)
@@ -146,6 +152,7 @@ def photographs(args: argparse.Namespace, settings: dict[str, str]) -> None:
 
 
 def main() -> None:
+    """The command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
