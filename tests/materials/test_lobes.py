@@ -26,7 +26,7 @@ LOBES = [
     (0.1, 0.1, 0.08, 0.8, 0.9),
     (0.0, 0.5, 1.0, 0.0, 0.9),
 ]
-VIEWS = [(0.0, 0.0), (0.6, 1.0), (1.2, 4.0), (1.5, 2.5)]
+VIEWS = [(0.0, 0.0), (1.2, 4.0), (1.5, 2.5)]
 every_pair = pytest.mark.parametrize(
     ("lobe", "view"), [(lobe, view) for lobe in LOBES for view in VIEWS]
 )
@@ -84,7 +84,7 @@ def test_samples_are_as_dense_as_they_say(
     pooled = [np.append(a[order][~few], a[order][few].sum()) for a in (seen, wanted)]
     if pooled[1][-1] == 0:
         pooled = [part[:-1] for part in pooled]
-    # Twenty pairs: one in a thousand fails where all is right, and the seed is fixed.
+    # Fifteen pairs: one in a thousand fails where all is right, and the seed is fixed.
     assert stats.chisquare(*pooled).pvalue > 5e-5
 
 
@@ -149,7 +149,10 @@ def noise(material: Material, *, places: int = 200, lights: int = 32) -> tuple[n
     return ours.mean(), cosine.mean(), ours.var(axis=1).mean(), cosine.var(axis=1).mean()
 
 
-@pytest.mark.parametrize("name", ["scratched", "print", "lacquered"])
+@pytest.mark.parametrize(
+    "name",
+    ["scratched", *(pytest.param(n, marks=pytest.mark.slow) for n in ("print", "lacquered"))],
+)
 def test_glossy_materials_are_half_as_noisy_as_under_cosine_samples(name: str) -> None:
     mean, cosine_mean, ours, cosine = noise(traced(name))
     # 200 x 32 samples of which the cosine's vary most
