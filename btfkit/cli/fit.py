@@ -222,10 +222,13 @@ def _to_go_on(report: FitReport) -> Outcome:
 
 def _next(report: FitReport) -> str:
     """What one does with a fitted model."""
-    from btfkit.materials import PROGRAMS
+    from btfkit.export.arrays import refuse_unknown
 
     out = shlex.quote(report.out or "")
     if report.material.model in ("neubtf", "neubtf-paper") and not report.untrained:
         return f"btfkit propagate guidance.png --model {out}"
-    drawn = report.material.model in PROGRAMS and not report.material.has_curvature
-    return f"btfkit view {out}" if drawn else f"btfkit render {out} --shape sphere"
+    try:
+        refuse_unknown(report.material.program(), "glsl")
+    except TypeError:
+        return f"btfkit render {out} --shape sphere"
+    return f"btfkit view {out}"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from btfkit.materials.base import Material
-from btfkit.program import DepthNetwork, Heights, Program
+from btfkit.program import Cover, DepthNetwork, Heights, OffsetNetwork, Program, Texture
 
 # Queries whose time is measured.
 _TIMED = 1 << 15
@@ -47,11 +47,15 @@ def explained(material: Material) -> dict[str, Any]:
             "levels": len(texture.levels),
             "texels": sum(level.shape[0] * level.shape[1] for level in texture.levels),
         }
-        for texture in program.textures
+        for texture in textures_of(program)
     ]
     networks = {"decoder": program.layers}
-    if isinstance(program.depth, DepthNetwork):
-        networks["depth"] = program.depth.layers
+    if isinstance(program.depth, (DepthNetwork, OffsetNetwork)):
+        networks["depth" if isinstance(program.depth, DepthNetwork) else "offset"] = (
+            program.depth.layers
+        )
+    if isinstance(program.cover, Cover):
+        networks["cover"] = program.cover.layers
     found["networks"] = {
         name: [layers[0].weight.shape[1], *(layer.weight.shape[0] for layer in layers)]
         for name, layers in networks.items()
@@ -71,6 +75,16 @@ def program_of(material: Material) -> Program | None:
         return material.program()
     except TypeError:
         return None
+
+
+def textures_of(program: Program) -> tuple[Texture, ...]:
+    """Every texture of features: the decoder's, and those of depth, offset and cover."""
+    more = []
+    if isinstance(program.depth, (DepthNetwork, OffsetNetwork)):
+        more.append(program.depth.texture)
+    if isinstance(program.cover, Cover):
+        more.append(program.cover.texture)
+    return (*program.textures, *more)
 
 
 def heights_of(material: Material, program: Program) -> dict[str, Any]:

@@ -37,7 +37,7 @@ def by_angle(light: Floats, view: Floats, psnr: Floats) -> bytes:
 
     def draw(figure: Figure) -> None:
         for column, (name, ways) in enumerate((("light", light), ("view", view))):
-            axes = figure.add_subplot(1, 4, column + 1, projection="polar")
+            axes: Any = figure.add_subplot(1, 4, column + 1, projection="polar")
             theta = np.degrees(np.arccos(np.clip(ways[order, 2], -1, 1)))
             phi = np.arctan2(ways[order, 1], ways[order, 0])
             dots = axes.scatter(phi, theta, c=psnr[order], s=16, cmap="viridis")
@@ -76,7 +76,7 @@ def polar(lights_deg: Floats, lines: Sequence[tuple[str, Floats, Floats, Floats]
 
     def draw(figure: Figure) -> None:
         for column, (name, curve, angles, values) in enumerate(lines):
-            axes = figure.add_subplot(1, len(lines), column + 1, projection="polar")
+            axes: Any = figure.add_subplot(1, len(lines), column + 1, projection="polar")
             axes.plot(np.radians(lights_deg), curve, linewidth=1.4)
             axes.plot(np.radians(angles), values, "k.", markersize=5)
             axes.set_theta_zero_location("N")

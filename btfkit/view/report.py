@@ -15,7 +15,7 @@ from btfkit.btf import BTF
 from btfkit.directions import from_angles
 from btfkit.materials.base import Material
 from btfkit.materials.evaluation import answer_pair, texel_centres
-from btfkit.materials.explained import explained, program_of, run_time
+from btfkit.materials.explained import explained, program_of, run_time, textures_of
 from btfkit.program import Heights, Program
 from btfkit.render import sheets, studio
 from btfkit.view import plots
@@ -199,9 +199,10 @@ def _inside(program: Program) -> list[str]:
             _heading("Heights"),
             _picture(plots.heights(_shrunk(tiles), tiles.shape), "heights"),
         ]
-    if program.textures:
+    textures = textures_of(program)
+    if textures:
         parts.append(_heading("Latent channels"))
-    for texture in program.textures:
+    for texture in textures:
         finest = _shrunk(np.asarray(texture.levels[0], float))
         low, high = np.quantile(finest, [0.005, 0.995], axis=(0, 1))
         grey = np.clip((finest - low) / np.maximum(high - low, 1e-12), 0, 1)

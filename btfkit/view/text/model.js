@@ -66,7 +66,7 @@ const view = (() => {
     gl.uniform3f(uniforms.lamp, ...(compared() ? MEASURED.lights[state.pair] : way(state.light)));
     gl.uniform3f(uniforms.seen, ...(compared() ? MEASURED.views[state.pair] : [0, 0, 0]));
     gl.uniform1f(uniforms.least, compared() ? MEASURED.least : 0);
-    gl.uniform1i(uniforms.shape, SHAPES.indexOf(now().shape));
+    gl.uniform1i(uniforms.shape, [...SHAPES, "mesh"].indexOf(now().shape));
     gl.uniform1i(uniforms.show, show);
     gl.uniform1f(uniforms.tile, tile);
     gl.uniform1f(uniforms.tileHeight, tileHeight);
