@@ -89,7 +89,7 @@ class Pool:
         """(k, c) what textures of pairs are to be multiplied by, one over their gains as they
         stand; None where there are no gains.
         """
-        return None if self._gained is None else 1 / self._gained.values[pairs]
+        return None if self._gained is None else np.float32(1) / self._gained.values[pairs]
 
     def at_step(self, step: int) -> None:
         """Bring the pool to what it holds at `step`; a resumed run may jump ahead."""
