@@ -2,39 +2,49 @@
 
     python benchmarks/loop.py                                  # a handful of imperfections
     python benchmarks/loop.py --without mosaic prnu --seed 3
+    python benchmarks/loop.py --small --without every          # all of them, on a small sensor
 
 Each row is a whole run of the twin: capture, calibrate, rectify, compare with the traced truth.
-About 25 CPU seconds a row.
+About 45 CPU seconds a row, 20 of the small one (320 x 240, four pairs, 32 x 32 texels).
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from btfkit.bench.loop import Looped, compare
+from btfkit.calibration.calibration import NAME
+from btfkit.calibration.stages import calibrate
+from btfkit.devices import mock
+from btfkit.devices.capture.plan import from_document
+from btfkit.devices.capture.run import measure
+from btfkit.devices.twin.imperfections import IMPERFECTIONS
+from btfkit.devices.twin.log import Twin, TwinLog, everything
+from btfkit.sequence import Sequence
 
-PLAN = (
-    '{"views": 4, "lights": 3, "reference_every": 30, "whites": 3, "colours": 1, "targets": 16, '
-    '"spheres": 12}'
-)
+PLAN: dict[str, Any] = {
+    "views": 4, "lights": 3, "reference_every": 30, "whites": 3, "colours": 1, "targets": 16,
+    "spheres": 12,
+}  # fmt: skip
+SMALL: dict[str, Any] = {
+    **PLAN, "views": [[0, 0], [60, 120]], "lights": [[30, 60], [60, 250]], "whites": 2,
+    "targets": 7, "spheres": 4,
+}  # fmt: skip
 HANDFUL = ("mosaic", "defocus", "shot-noise")
-BTFKIT = Path(sys.executable).with_name("btfkit")
 
 
-def looped(folder: Path, options: list[str], seed: int) -> Looped:
+def looped(folder: Path, twin: Twin, plan: dict[str, Any]) -> Looped:
     """One run of the twin against its truth."""
-    plan, run = folder / "plan.json", folder / "run"
-    plan.write_text(PLAN)
-    for line in (
-        ["capture", "--device", "mock", "--plan", plan, "-o", run, "--seed", str(seed), *options],
-        ["calibrate", run],
-    ):
-        subprocess.run([BTFKIT, *map(str, line), "--quiet"], check=True, stdout=subprocess.DEVNULL)
+    run = folder / "run"
+    log = TwinLog(run, twin)
+    rig = mock.open_rig(log.begin(), log=log)
+    measure(rig, from_document("loop", plan), run, synthetic=True)
+    found, _ = calibrate(Sequence.open(run))
+    found.save(run / NAME)
     return compare(run)
 
 
@@ -43,14 +53,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--without", nargs="*", default=list(HANDFUL))
     parser.add_argument("--seed", type=int, default=8)
+    parser.add_argument("--small", action="store_true")
     given = parser.parse_args()
-    rows = {"all": [], "none": ["--perfect"]}
-    rows |= {f"all but {name}": ["--without", name] for name in given.without}
+    names = list(IMPERFECTIONS) if given.without == ["every"] else given.without
+    rows: dict[str, tuple[str, ...]] = {"all": (), "none": everything()}
+    rows |= {f"all but {name}": (name,) for name in names}
+    size = {"width": 320, "height": 240} if given.small else {}
     first: float | None = None
-    for name, options in rows.items():
+    for name, without in rows.items():
         start = os.times()
+        twin = Twin(seed=given.seed, without=without, **size)
         with tempfile.TemporaryDirectory() as folder:
-            found = looped(Path(folder), options, given.seed)
+            found = looped(Path(folder), twin, SMALL if given.small else PLAN)
         now = os.times()
         cpu = sum(now[:4]) - sum(start[:4])
         error = 10 ** (-found.psnr() / 10)

@@ -117,7 +117,7 @@ def _partners(
     cosine = light[theirs] @ light[ours].T
     order = np.argsort(-cosine, axis=None)
     used: set[int] = set()
-    out = []
+    out: list[tuple[int, int]] = []
     for flat in order.tolist():
         a, b = divmod(flat, len(ours))
         if cosine[a, b] < np.cos(np.radians(_SAME_LIGHT_DEG)) or len(out) == _LIGHTS:

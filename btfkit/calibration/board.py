@@ -26,7 +26,7 @@ _REACH_SQUARES, _REACH_PX = 0.6, 11
 _SUBPIXELS = 2
 # Windows that the drawing leaves this much more of than of most show something else too.
 _COVERED = 3.0
-_SETTLED_PX = 2e-3
+_SETTLED_PX = 1e-2
 # Corners that are enough to tell how sharp the lens is.
 _BLUR_CORNERS = 24
 
@@ -172,7 +172,7 @@ class Board:
             drawn = self._drawn(window, shift, camera, pose, blur_px)
             step = window.fit(drawn)
             shift += step
-            # What is left then is the square of it.
+            # What is left then is a tenth of it and less.
             if not np.nanmedian(np.abs(step)) > _SETTLED_PX:
                 break
         left = window.misfit(drawn)

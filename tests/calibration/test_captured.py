@@ -190,3 +190,125 @@ def test_stray_light_of_a_window_is_that_of_the_whole_frame(cfa):
     # A fortieth of a slope's mean at the most, of which 2 % are stray light.
     np.testing.assert_allclose(found.radiance, expected, rtol=5e-4)
     assert (found.radiance < whole.radiance[window]).all()
+
+
+def test_a_calibration_is_named_and_one_of_other_frames_is_refused(run, tmp_path):
+    from btfkit.calibration.stages import calibrate
+
+    elsewhere = tmp_path / "elsewhere.json"
+    found, _ = calibrate(Sequence.open(run))
+    found.save(elsewhere)
+    btf = btfkit.open(run, calibration=elsewhere)
+    assert btf.provenance["calibration"]["document"] == str(elsewhere)
+    assert btf.provenance["calibration"]["ran"] == []
+    np.testing.assert_array_equal(btf.texture(1), btfkit.open(run).texture(1))
+    edited(run, lambda d: d["sensor"].update(read_noise_e=4.0))
+    with pytest.raises(CalibrationError, match=r"elsewhere.json: its section 'radiometry' was not"):
+        btfkit.open(run, calibration=elsewhere)
+    with pytest.raises(FileNotFoundError):
+        btfkit.open(run, calibration=tmp_path / "none.json")
+
+
+def planned(run, **plan):
+    """The run as one that was planned with more pairs than were taken."""
+    table = run / "sequence.csv"
+    lines = table.read_text().splitlines()
+    numbered = [f"{line},{k}" for k, line in zip((0, 1, 3, 4), lines[1:], strict=True)]
+    table.write_text("\n".join([lines[0] + ",pair", *numbered]) + "\n")
+    lights = [[0, 0], [30, 90], [60, 180]]
+    return edited(run, lambda d: d.update(
+        complete=False, plan={"views": [[0, 0], [45, 0]], "lights": lights, **plan}
+    ))  # fmt: skip
+
+
+def test_a_part_of_a_run_is_refused_by_what_is_missing_and_masked_when_asked(run):
+    (planned(run) / "frames" / "003.png").unlink()
+    message = r"2 of 6 planned pairs were not taken \(first: pair 2\); 1 listed frames are not there \(first: frames/003.png\).*--partial"
+    with pytest.raises(CalibrationError, match=message):
+        btfkit.open(run)
+    btf = btfkit.open(run, partial=True)
+    assert btf.shape[0] == 6
+    assert btf.validity.all((1, 2)).tolist() == [True, True, True, False, False, False]
+    assert np.isnan(btf.texture(3)).all()
+    assert np.isnan(btf.texture(5)).all()
+    assert np.isfinite(btf.texture(2)).mean() > 0.5
+    assert btf.provenance["partial"] == {"files": ["frames/003.png"], "pairs": [2, 5], "planned": 6}
+    # Pairs 2 and 5 are both views under the third light.
+    np.testing.assert_allclose(btf.light[4:], [[-np.sqrt(0.75), 0, 0.5]] * 2, atol=1e-6)
+    np.testing.assert_allclose(btf.view[5], [np.sqrt(0.5), 0, np.sqrt(0.5)], atol=1e-6)
+
+
+def test_a_plan_with_pairs_of_its_own_and_a_whole_run_lack_nothing(run):
+    from btfkit.calibration.partial import lacking
+
+    assert not lacking(Sequence.open(run))
+    pairs = [[0, 0], [1, 2], [0, 1], [1, 1], [0, 2]]
+    assert lacking(Sequence.open(planned(run, pairs=pairs))).pairs == (2,)
+
+
+def test_a_run_none_of_whose_frames_is_there_is_refused(run):
+    for path in (run / "frames").iterdir():
+        path.unlink()
+    with pytest.raises(CalibrationError, match="none of the sample's frames is there"):
+        btfkit.open(run, partial=True)
+
+
+def cloth(run, high_mm):
+    """The run as one of a cloth that lies so high above the plane of the sample.
+
+    Frames are rays cast onto its pattern, by hand; the lights only scale it.
+    """
+    edited(run, lambda document: document["target"]["sample"].update(size_mm=[6, 5]))
+    columns, rows = np.meshgrid(np.arange(64.0), np.arange(48.0))
+    turn = np.array([[1, 0, 0], [0, -0.857493, -0.514496], [0, 0.514496, -0.857493]])
+    ray = np.stack([(columns - 31.5) / 400, (rows - 23.5) / 400, np.ones_like(rows)], -1) @ turn
+    document = json.loads((run / "sequence.json").read_text())
+    eye = np.array(document["rig"]["camera"]["position_mm"], float)
+    for k in range(4):
+        angle = 0.4 * (k // 2)
+        c, s = np.cos(angle), np.sin(angle)
+        spun = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        origin, toward = spun @ eye, ray @ spun.T
+        at = origin + toward * ((high_mm - origin[2]) / toward[..., 2])[..., None]
+        x, y = at[..., 0], at[..., 1]
+        cloth = np.sin(2.9 * x + 0.4 * y) + np.sin(3.3 * y - 0.6 * x) + np.sin(1.7 * x + 2.2 * y)
+        image = 200 + (1 + 0.3 * (k % 2)) * (900 + 200 * cloth)
+        path = run / "frames" / f"{k:03}.png"
+        path.write_bytes(counts.encode_png(np.rint(image).astype(np.uint16)))
+    return run
+
+
+def test_a_view_that_shows_the_sample_displaced_is_moved_to_where_the_squarest_does(run):
+    cloth(run, 0.12)
+    options = {"texel_mm": 0.25}
+    off, moved = (btfkit.open(run, register=r, **options) for r in (False, True))
+    found = moved.provenance["registration"]
+    # A sample that lies 0.12 mm high is seen 0.12 x 60 / 100 mm nearer to each camera; the ring is
+    # 0.4 rad between them, and the two places differ by 2 sin(0.2) of that.
+    apart = 2 * np.sin(0.2) * 0.12 * 60 / 100 / 0.25
+    assert found["largest_texels"] == pytest.approx(apart, rel=0.15)
+    assert found["untold"] == []
+    middle = slice(4, -4), slice(4, -4)
+    before, after = (np.nanstd(b.texture(2)[middle] - b.texture(0)[middle]) for b in (off, moved))
+    # 24 x 20 texels under a window tell a shift to some hundredths, of which there were eleven.
+    assert after < 0.6 * before
+    np.testing.assert_array_equal(off.texture(0), moved.texture(0))
+
+
+def test_views_are_compared_without_parallax_where_the_relief_is_known(run, tmp_path):
+    from btfkit.relief import file
+    from btfkit.relief.relief import Relief
+
+    cloth(run, 0.12)
+    height = np.full((10, 12), 0.12 / 6, np.float32)
+    maps = {"albedo": np.full((10, 12, 3), 0.5), "specular": np.zeros((10, 12, 3))}
+    file.write(Relief(height, **maps, roughness=np.full((10, 12), 0.5), texel_mm=0.5),
+               tmp_path / "high.exr")  # fmt: skip
+    btf = btfkit.open(run, register=True, relief=tmp_path / "high.exr", texel_mm=0.25)
+    # The relief explains all of it: nothing is left for a shift to do.
+    assert btf.provenance["registration"]["largest_texels"] < 0.02
+    wide = Relief(np.zeros((10, 20), np.float32), np.full((10, 20, 3), 0.5, np.float32),
+                  np.zeros((10, 20, 3), np.float32), np.full((10, 20), 0.5, np.float32))  # fmt: skip
+    file.write(wide, tmp_path / "wide.exr")
+    with pytest.raises(CalibrationError, match=r"wide.exr is 20 x 10 texels; the sample's area is"):
+        btfkit.open(run, relief=tmp_path / "wide.exr")
