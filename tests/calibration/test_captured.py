@@ -292,7 +292,9 @@ def test_a_view_that_shows_the_sample_displaced_is_moved_to_where_the_squarest_d
     before, after = (np.nanstd(b.texture(2)[middle] - b.texture(0)[middle]) for b in (off, moved))
     # 24 x 20 texels under a window tell a shift to some hundredths, of which there were eleven.
     assert after < 0.6 * before
-    np.testing.assert_array_equal(off.texture(0), moved.texture(0))
+    # Both look as squarely: one of them stays.
+    stays = [np.array_equal(off.texture(k), moved.texture(k), equal_nan=True) for k in range(4)]
+    assert stays in ([True, True, False, False], [False, False, True, True])
 
 
 def test_views_are_compared_without_parallax_where_the_relief_is_known(run, tmp_path):
