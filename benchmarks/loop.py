@@ -32,7 +32,7 @@ PLAN: dict[str, Any] = {
 }  # fmt: skip
 SMALL: dict[str, Any] = {
     **PLAN, "views": [[0, 0], [60, 120]], "lights": [[30, 60], [60, 250]], "whites": 2,
-    "targets": 7, "spheres": 4,
+    "targets": 7, "spheres": 8,
 }  # fmt: skip
 HANDFUL = ("mosaic", "defocus", "shot-noise")
 

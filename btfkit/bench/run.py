@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, final
 
-from btfkit.bench import answers, kernels, plots, real, tables
+from btfkit.bench import answers, kernels, plots, real, stages, tables
 from btfkit.bench.cases import (
     Case,
     asked,
@@ -45,6 +45,7 @@ class Profile:
         seed: of data and models. kernel_seconds: a figure of the kernel tables; 0 for none.
         measured: whether pairs of stores are held out by their angle to the nearest pair trained
             on, and the scoreboard of `btfkit.bench.real` is written.
+        stages: of a calibration, by name. small_stages: whether at sizes that take seconds.
     """
 
     materials: tuple[str, ...] = ("cobbles", "woven", "scratched", "print")
@@ -58,6 +59,8 @@ class Profile:
     seed: int = 0
     kernel_seconds: float = 0.5
     measured: bool = False
+    stages: tuple[str, ...] = ()
+    small_stages: bool = False
 
     @property
     def sources(self) -> tuple[str | Path, ...]:
@@ -67,7 +70,7 @@ class Profile:
 
 QUICK = Profile(
     materials=("cobbles", "print"), budgets_cpu_s=(0.5, 1.5), size=48, directions=12,
-    kernel_seconds=0.1,
+    kernel_seconds=0.1, small_stages=True,
 )  # fmt: skip
 
 # What a scoreboard of measured materials changes of a profile.
@@ -99,10 +102,12 @@ def run(profile: Profile, folder: Path, *, progress: Progress | None = None) -> 
     _claim(folder, profile)
     _run_missing(profile, folder, progress)
     _score(profile, folder)
+    stages.run_missing(folder, profile.stages, seed=profile.seed, quick=profile.small_stages)
     further = {
         "machine": machine(),
         "profile": json.loads(json.dumps(asdict(profile), default=str)),
         **_kernels(folder, profile),
+        "stages": stages.finished(folder),
     }
     rows: list[dict[str, Any]] | None = None
     results: dict[str, Any] = {}
@@ -230,6 +235,7 @@ def _check(profile: Profile) -> None:
     for kind, given, known in (
         ("model", profile.models, MODELS),
         ("material", profile.materials, CATALOGUE),
+        ("stage", profile.stages, stages.STAGES),
     ):
         for name in given:
             if name not in known:

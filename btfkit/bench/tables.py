@@ -50,6 +50,7 @@ def markdown(results: Mapping[str, Any]) -> str:
             levels(here, "mse x 1e-3 by level", lambda level: f"{1e3 * level['mse']:.3f}"),
             levels(here, "log1p dB by level", lambda level: f"{float(level['psnr_log1p']):.2f}"),
         ]
+    parts += stages(results.get("stages", {}))
     for title, key in (
         ("Kernels, one thread", "kernels"),
         ("The loop beside its kernel", "loop"),
@@ -59,6 +60,16 @@ def markdown(results: Mapping[str, Any]) -> str:
         if key in results:
             parts += [f"## {title}\n", generic(results[key])]
     return "\n".join(part for part in parts if part) + "\n"
+
+
+def stages(found: Mapping[str, Sequence[Row]]) -> list[str]:
+    """A table a stage of the calibration."""
+    titles = {
+        "merge": "Merging: relative deviation by decade of electrons a second",
+        "bundle": "Adjustment of a rig, by views",
+        "rectify": "Rectification, signal to noise",
+    }
+    return [f"## {titles[name]}\n\n{generic(rows)}" for name, rows in found.items()]
 
 
 def others(rows: Sequence[Row], machine: Row) -> str:
@@ -189,4 +200,6 @@ def _in(form: str, value: Any, times: float = 1) -> str:
 
 
 def _short(value: Any) -> str:
+    if value is None:
+        return ""
     return f"{value:.3g}" if isinstance(value, float) else str(value)

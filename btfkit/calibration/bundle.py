@@ -169,7 +169,8 @@ def _observed(
     """
     columns = np.flatnonzero(free)
     _, jacobian = problem.evaluate(x)
-    scaled = (jacobian[np.flatnonzero(use)][:, columns].multiply(problem.scale[columns])).toarray()
+    told = np.flatnonzero(use[: problem.told])
+    scaled = (jacobian[told][:, columns].multiply(problem.scale[columns])).toarray()
     _, values, across = np.linalg.svd(scaled, full_matrices=len(scaled) < len(columns))
     sizes = np.zeros(len(columns))
     sizes[: len(values)] = values
@@ -178,10 +179,10 @@ def _observed(
         return free
     weighted = flat * problem.give_up[columns]
     _, _, order = linalg.qr(weighted, mode="economic", pivoting=True)
-    told = free.copy()
-    told[columns[order[: len(flat)]]] = False
+    still = free.copy()
+    still[columns[order[: len(flat)]]] = False
     # What is left must be told by itself: giving up one may not have been enough.
-    return _observed(problem, x, use, told) if told.any() else told
+    return _observed(problem, x, use, still) if still.any() else still
 
 
 def _inliers(problem: Problem, residual: Floats) -> NDArray[np.bool_]:

@@ -27,8 +27,9 @@ Floats = NDArray[np.float64]
 Index = NDArray[np.intp]
 # Expected noise of an observation, px: relative weights of the kinds.
 _SD_PX = {"corner": 0.02, "outline": 0.15, "highlight": 0.02}
-# How far the noise of a kind may be from what was expected.
-_NOISE = (0.1, 5.0)
+# How far the noise of a kind may be from what was expected. Highlights are few for what they tell:
+# what they leave is less than their noise.
+_NOISE = {"corner": (0.1, 5.0), "outline": (0.5, 5.0), "highlight": (0.5, 5.0)}
 # Of a corner that was fitted to a frame, however little the fit leaves.
 _LEAST_PX = 0.002
 # What is assumed beforehand of each kind of parameter: the scale of the solver, and what the
@@ -38,6 +39,9 @@ _SCALE_PX = {"fx": 0.05, "fy": 0.05, "cx": 0.05, "cy": 0.05}
 _SCALE_LENS = {"k1": 0.02, "k2": 0.02, "p1": 0.005, "p2": 0.005, "k3": 1e-3}
 _POWER_LENS = {"k1": 2, "k2": 4, "p1": 1, "p2": 1, "k3": 6}
 _SCALE_TURN, _SCALE_MM, _SCALE_LIGHT_MM = 0.05, 5.0, 50.0
+# How good a drawing of a rig is: what frames hardly tell stays near it. The camera and what lies
+# on the holder are told by every frame.
+_DRAWN = {"turn": 0.02, "mm": 2.0, "light": 20.0}
 _LENS_GIVES_UP, _BOARD_GIVES_UP = 10.0, 100.0
 
 
@@ -95,6 +99,8 @@ class Problem:
 
     Attributes:
         names, scale: of the parameters: lens, camera pose, axes, board, spheres, lights, slips.
+        told: how many residuals come from frames and readings; those after them, to `count`, say
+            how near to its drawing a rig is.
         give_up: how willingly a parameter is held where frames do not tell it from others.
     """
 
@@ -145,7 +151,7 @@ class Problem:
             mine = residual[rows[use[rows]]]
             if len(mine):
                 noise = self._noise[kind] * float(np.sqrt((mine**2).mean()))
-                self._noise[kind] = float(np.clip(noise, *_NOISE))
+                self._noise[kind] = float(np.clip(noise, *_NOISE[kind]))
 
     def by_sighting(self, residual: Floats, of: Callable[[Floats], Any]) -> Floats:
         """(v,) a figure of the distances in each sighting, px."""
@@ -195,6 +201,14 @@ class Problem:
                 sparse.csr_array(
                     (weight, (np.arange(free), self._shared + np.arange(free))),
                     shape=(free, self.size),
+                )
+            )
+        if len(self._drawn):
+            rows = np.arange(len(self._drawn))
+            residuals.append(x[self._drawn] / self._drawn_sd)
+            jacobians.append(
+                sparse.csr_array(
+                    (1 / self._drawn_sd, (rows, self._drawn)), shape=(len(rows), self.size)
                 )
             )
         return np.concatenate(residuals), sparse.csr_array(sparse.vstack(jacobians))
@@ -272,7 +286,20 @@ class Problem:
         self._rows = {
             kind: np.arange(a, b) for kind, a, b in zip(counts, ends[:-1], ends[1:], strict=True)
         }
-        self.count = int(ends[-1]) + self.size - self._shared
+        self.told = int(ends[-1]) + self.size - self._shared
+        drawn = [
+            (
+                i,
+                _DRAWN[
+                    "light" if name.startswith("light") else "turn" if "direction" in name else "mm"
+                ],
+            )
+            for i, name in enumerate(self.names)
+            if name.startswith(("axis.", "light."))
+        ]
+        self._drawn = np.array([i for i, _ in drawn], np.intp)
+        self._drawn_sd = np.array([sd for _, sd in drawn])
+        self.count = self.told + len(drawn)
 
     def _axis(self, axis: Axis, x: Floats) -> Axis:
         offset = x[self._at[f"axis.{axis.name}"]]

@@ -110,24 +110,18 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
 
 
 def slips_of(start: Geometry, sightings: list[Sighting]) -> dict[str, float]:
-    """By how much each axis stands off its readings, rms, radians or mm, as the board tells.
+    """By how much axes stand off their readings, rms, radians or mm, as the board tells.
 
-    An axis that moves neither sample nor camera is taken to be as good as the worst of its kind.
+    Only of those that move sample or camera: a highlight tells less of a lamp's than any encoder.
     """
-    kinematics = start.kinematics
-    loose = {axis.name: _LOOSE[axis.kind] for axis in kinematics.axes}
-    if len(sightings) < _FEWEST_FOR_SLIPS:
+    chains = start.kinematics.chains
+    told = {*chains.get("sample", ()), *chains.get("camera", ())}
+    loose = {a.name: _LOOSE[a.kind] for a in start.kinematics.axes if a.name in told}
+    if len(sightings) < _FEWEST_FOR_SLIPS or not loose:
         return {}
-    slips = adjust(start, sightings, slip_sd=loose).slips
-    size = np.sqrt((slips**2).mean(axis=0))
-    told = {*kinematics.chains.get("sample", ()), *kinematics.chains.get("camera", ())}
-    own = {axis.name: float(s) for axis, s in zip(kinematics.axes, size, strict=True)}
-    worst = {
-        kind: max((own[a.name] for a in kinematics.axes if a.name in told and a.kind == kind),
-                  default=0.0)
-        for kind in _LOOSE
-    }  # fmt: skip
-    return {a.name: own[a.name] if a.name in told else worst[a.kind] for a in kinematics.axes}
+    size = np.sqrt((adjust(start, sightings, slip_sd=loose).slips ** 2).mean(axis=0))
+    of = zip(start.kinematics.axes, size.tolist(), strict=True)
+    return {axis.name: slip for axis, slip in of if axis.name in told}
 
 
 def _seen_again(

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 @verb(
     "bench",
     example="""btfkit bench cobbles wool.btf.zarr --model neumip --model pca --quick
+btfkit bench merge bundle rectify -o stages
 btfkit bench wool.btf.zarr --questions && btfkit bench wool.btf.zarr --answers ours=answers.npz""",
 )
 @click.argument("names", nargs=-1)
@@ -67,9 +68,10 @@ def bench_verb(
     """Fit models to materials within budgets, and write what each cost and how far off it is.
 
     NAMES: materials of `btfkit synth --list`, or stores, query files and whatever else `ingest`
-    reads. Writes bench.json, tables (bench.md, bench.csv, bench.tex) and two plots of all that
-    the folder holds: what former calls finished is kept and told with the rest, so that models,
-    budgets and materials may be run one after the other, or by several processes at a time;
+    reads; merge, bundle and rectify measure those stages of a calibration by themselves. Writes
+    bench.json, tables (bench.md, bench.csv, bench.tex) and two plots of all that the folder holds:
+    what former calls finished is kept and told with the rest, so that models, budgets and
+    materials may be run one after the other, or by several processes at a time;
     --cluster gives each material to a worker, names those that fail, and ends in the same tables.
 
     --real DIR: every measured material of a folder. Held-out pairs are alone or in holes, errors
@@ -80,7 +82,8 @@ def bench_verb(
     """
     from btfkit.bench.real import PAGE, PICTURES, sources_in
     from btfkit.bench.run import QUICK, REAL, Profile, ask, run
-    from btfkit.bench.tables import brief
+    from btfkit.bench.stages import STAGES
+    from btfkit.bench.tables import brief, stages
     from btfkit.errors import meaning
     from btfkit.relief.procedural import CATALOGUE
 
@@ -93,7 +96,11 @@ def bench_verb(
         profile = replace(profile, stores=tuple(found_there), materials=(), **REAL)
         if quick:
             profile = replace(profile, budgets_cpu_s=QUICK.budgets_cpu_s)
-    if names:
+    profile = replace(profile, stages=tuple(name for name in names if name in STAGES))
+    if profile.stages and set(names) <= set(STAGES):
+        profile = replace(profile, materials=(), models=(), kernel_seconds=0.0)
+    elif names:
+        names = tuple(name for name in names if name not in STAGES)
         stores = tuple(Path(name) for name in names if name not in CATALOGUE)
         for path in stores:
             if not path.exists():
@@ -129,7 +136,9 @@ def bench_verb(
     found = run(profile, folder, progress=bar)
     pages = (PAGE, *PICTURES) if real is not None else ()
     files = [folder / name for name in (*FILES, *pages)]
-    line = f"{folder}: {len(found['cells'])} cells\n\n{brief(found['cells'])}"
+    told = [brief(found["cells"])] if found["cells"] else []
+    told += stages({name: found["stages"][name] for name in profile.stages})
+    line = f"{folder}: {len(found['cells'])} cells\n\n" + "\n".join(told)
     line += "".join(f"\nnot read: {reason}" for reason in declined.values())
     first = folder / (PAGE if real is not None else "bench.md")
     data = {**found, "files": files} | ({"declined": declined} if real is not None else {})
@@ -148,7 +157,9 @@ def _on_cluster(
     """Run every material on a worker; returns the profile of those that did not fail."""
     folder.mkdir(parents=True, exist_ok=True)
     profile = replace(profile, stores=tuple(path.absolute() for path in profile.stores))
-    tasks = {str(source): (_alone(profile, source), folder) for source in profile.sources}
+    # Stages of a calibration are measured here, once.
+    alone = replace(profile, stages=())
+    tasks = {str(source): (_alone(alone, source), folder) for source in profile.sources}
     outcome = over(where, tasks, _task, bar)
     failed: list[dict[str, Any]] = list(outcome.data["failed"])
     names = {each["source"] for each in failed}

@@ -441,3 +441,43 @@ def training_part(store):
     """The pairs of a store that its models are trained on."""
     btf = open_btf(store)
     return btf.subset(split(len(btf))[0])
+
+
+@pytest.mark.slow
+def test_stages_of_a_calibration_are_measured_by_themselves_and_kept(tmp_path, capsys):
+    line = ["bench", "merge", "bundle", "rectify", "--quick", "-o", str(tmp_path / "out"), "--json"]
+    assert run_cli(btfkit, line) == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["cells"] == []
+    stages = found["stages"]
+    assert [len({row[size] for row in stages[name]}) for name, size in
+            (("merge", "megapixels"), ("bundle", "views"), ("rectify", "texels"))] == [3, 3, 3]  # fmt: skip
+    largest = {row["method"]: row for row in stages["merge"] if row["megapixels"] > 0.06}
+    ours, bound = largest["noise model, iterated"], largest["bound"]
+    # Thirteen thousand pixels a decade tell a deviation to a half per cent.
+    assert (
+        bound["sd 20"] * 0.97
+        < ours["sd 20"]
+        < 1.05 * bound["sd 20"]
+        < largest["hat weights"]["sd 20"]
+    )
+    held = [row["held out, px"] for row in stages["bundle"]]
+    assert max(held) < 0.02
+    assert (
+        stages["bundle"][-1]["focal length, relative"]
+        < 4 * stages["bundle"][-1]["its sd, relative"]
+    )
+    straight = {row["method"]: row for row in stages["rectify"]
+                if row["texels"] == 16 and row["tilt, degrees"] == 0}  # fmt: skip
+    assert straight["ewa"]["dB to Gaussians"] > straight["bilinear"]["dB to Gaussians"] + 10
+    assert straight["area"]["dB to areas"] > straight["bilinear"]["dB to areas"] + 5
+    page = (tmp_path / "out" / "bench.md").read_text()
+    assert "## Merging" in page
+    assert "| hat weights |" in page
+    # What is there is not measured again, and other sizes do not mix with it.
+    kept = (tmp_path / "out" / "stages" / "merge.json").stat().st_mtime_ns
+    assert run_cli(btfkit, line) == 0
+    assert (tmp_path / "out" / "stages" / "merge.json").stat().st_mtime_ns == kept
+    line = [*line[:4], "--size", "48", "--directions", "12", *line[5:]]
+    assert run_cli(btfkit, line) == 1
+    assert "was measured with" in capsys.readouterr().err
