@@ -157,7 +157,9 @@ def _on_cluster(
     """Run every material on a worker; returns the profile of those that did not fail."""
     folder.mkdir(parents=True, exist_ok=True)
     profile = replace(profile, stores=tuple(path.absolute() for path in profile.stores))
-    tasks = {str(source): (_alone(profile, source), folder) for source in profile.sources}
+    # Stages of a calibration are measured here, once.
+    alone = replace(profile, stages=())
+    tasks = {str(source): (_alone(alone, source), folder) for source in profile.sources}
     outcome = over(where, tasks, _task, bar)
     failed: list[dict[str, Any]] = list(outcome.data["failed"])
     names = {each["source"] for each in failed}
