@@ -79,7 +79,7 @@ def source(program: Program, *, model: str, texel_mm: float | None = None) -> tu
         else "float(std::clamp(u, 0.0, 1.0)), float(std::clamp(v, 0.0, 1.0))",
         "steepest": _number(STEEPEST), "lowest": _number(LOWEST_COSINE), "looks": LOOKS,
         "epsilon": _number(EPSILON),
-        "scale": _number(program.depth.scale) if _scaled(program) else "0.0f",
+        "scale": _number(_scale(program)),
         **_curvature(program),
     }  # fmt: skip
     parts = sections("material.hpp.txt")
@@ -160,8 +160,9 @@ def fnv(data: bytes) -> int:
     return found
 
 
-def _scaled(program: Program) -> bool:
-    return isinstance(program.depth, (Heights, DepthNetwork))
+def _scale(program: Program) -> float:
+    found = program.depth
+    return found.scale if isinstance(found, (Heights, DepthNetwork)) else 0.0
 
 
 def _curvature(program: Program) -> dict[str, object]:

@@ -12,6 +12,7 @@ import btfkit
 from btfkit import metrics
 from btfkit.errors import FitError
 from btfkit.fitting.fit import fit
+from btfkit.fitting.sbtf import tracing
 from btfkit.fitting.sbtf.holes import opacity_of, thickness_of
 from btfkit.fitting.sbtf.outlines import moved
 from btfkit.fitting.sbtf.tracing import queries_of
@@ -142,7 +143,13 @@ def test_heights_that_are_said_to_be_given_need_a_relief() -> None:
         fit(queries, model="sbtf", steps=1, settings={"heights": "given"})
     with pytest.raises(ValueError, match="expected one of auto, found, given"):
         fit(queries, model="sbtf", steps=1, settings={"heights": "guessed"})
+    plane = fit(queries, model="sbtf", steps=1, settings={"batch": 512})
+    assert (
+        "outlines and displaced places are those of heights from the parallax"
+        in (plane.untrained[0])
+    )
     found = fit(relief(), model="sbtf", steps=1, settings={"heights": "found", "levels": 1})
+    assert not found.untrained
     assert not np.allclose(
         found.material.layout.surface(found.material.texels) * 0.05, relief().height, atol=1e-3
     )
@@ -304,7 +311,8 @@ def sheet() -> Relief:
     return procedural.make("perforated", 36, relief_texels=2.5).under_surface()[0]
 
 
-def test_a_known_relief_with_holes_is_seen_through(tmp_path) -> None:
+def test_a_known_relief_with_holes_is_seen_through(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(tracing, "_A_TEXEL", 8)
     out = tmp_path / "a.safetensors"
     settings = {"levels": 1, "batch": 512}
     model = fit(sheet(), model="sbtf", steps=1, settings=settings, out=out).material
