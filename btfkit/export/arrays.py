@@ -42,7 +42,7 @@ def textures(program: Program) -> Iterator[Texture]:
 
 
 # Targets that follow rays which curvature bends.
-BENT = ("npz", "cpp", "glsl")
+BENT = ("npz", "exr", "cpp", "glsl")
 
 
 def holes(program: Program) -> list[Texture]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.export.arrays import narrowed, refuse_bent
+from btfkit.export.arrays import narrowed
 from btfkit.export.npz import reader
 from btfkit.io.images.encoding import write_exr
 from btfkit.materials.base import Material
@@ -26,7 +26,6 @@ _LEFT = ("textures", "layers", "scaling", "depth", "heads")
 
 def write(material: Material, program: Program, folder: Path) -> None:
     """`model.json`, an EXR for each level of each texture, and `evaluate.py`."""
-    refuse_bent(program, "exr")
     found: dict[str, Any] = {"version": VERSION, "model": material.model}
     found |= {n: getattr(program, n) for n in program.__dataclass_fields__ if n not in _LEFT}
     found["heads"] = [{"kind": head.kind, "count": head.count} for head in program.heads]
@@ -62,7 +61,12 @@ def layer_described(layer: Dense) -> dict[str, Any]:
 def _depth(depth: Heights | DepthNetwork, folder: Path) -> dict[str, Any]:
     if isinstance(depth, Heights):
         (name,) = _mips("heights", (depth.heights[..., None],), folder)
-        return {"heights": name, "scale": depth.scale, "curved": depth.curved}
+        found: dict[str, Any] = {"heights": name, "scale": depth.scale, "curved": depth.curved}
+        if depth.curved:
+            found["looks"] = depth.looks
+        if depth.opacity is not None:
+            (found["opacity"],) = _mips("opacity", (depth.opacity[..., None],), folder)
+        return found
     return {
         "texture": _texture(depth.texture, "offset", folder),
         "inputs": list(depth.inputs),

@@ -81,9 +81,10 @@ def agree(rgb: np.ndarray, opacity: np.ndarray, response: Response, rows: np.nda
 
 
 @every_case
-def test_the_reader_in_numpy_follows_bent_rays(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("target", ["npz", pytest.param("exr", marks=pytest.mark.slow)])
+def test_the_reader_in_numpy_follows_bent_rays(target: str, name: str, tmp_path: Path) -> None:
     material, queries = made(name), asked()
-    export(material, "npz", tmp_path / "out")
+    export(material, target, tmp_path / "out")
     np.savez(tmp_path / "q.npz", **queries)  # type: ignore[arg-type]
     command = [sys.executable, tmp_path / "out" / "evaluate.py", tmp_path / "q.npz"]
     subprocess.run([*command, tmp_path / "a.npz"], check=True)

@@ -272,9 +272,8 @@ def test_what_no_export_knows_is_refused_by_name(tmp_path: Path) -> None:
     for target in ("wgsl", "slang"):
         with pytest.raises(TypeError, match=f"{target} has no form here for rays that bend"):
             shaded(bends, target, model="sbtf")
-    for writer in (exr, three):
-        with pytest.raises(TypeError, match="has no form here for rays that bend"):
-            writer.write(material, bends, tmp_path)
+    with pytest.raises(TypeError, match="three has no form here for rays that bend"):
+        three.write(material, bends, tmp_path)
     assert not list(tmp_path.iterdir())
     large = Lambert(
         LambertSpec((1, 8200)), {"texture": np.ones((1, 8200, 3), np.float32)}, Header((1, 8200))
