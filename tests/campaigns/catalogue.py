@@ -18,12 +18,14 @@ class Campaign:
         where: `module:function` that prepares it.
         share: of the time, beside the others.
         limit_s: CPU seconds a seed. limit_bytes: a seed; None where it starts processes.
+        root: whether it mounts disks.
     """
 
     where: str
     share: float = 1.0
     limit_s: float = LIMIT_S
     limit_bytes: int | None = LIMIT_BYTES
+    root: bool = False
 
     @property
     def prepare(self) -> Callable[[Path], Attempt]:
@@ -40,5 +42,5 @@ CAMPAIGNS = {
     "malice": Campaign("campaigns.malice:malice", share=2, limit_s=20),
     "queries": Campaign("campaigns.queries:queries", share=4, limit_s=30, limit_bytes=None),
     "kills": Campaign("campaigns.kills:kills", share=4, limit_s=300, limit_bytes=None),
-    "disks": Campaign("campaigns.kills:disks", share=2, limit_s=300, limit_bytes=None),
+    "disks": Campaign("campaigns.kills:disks", share=2, limit_s=300, limit_bytes=None, root=True),
 }

@@ -25,7 +25,7 @@ LIMIT_BYTES = 1 << 30
 # A worker flushes its counts this often; what a crash takes with it is not counted.
 _FLUSH_S = 1.0
 # Looked at by wall clock only after the processor's: machines are shared.
-_WALL_FACTOR = 12
+_WALL_FACTOR = 60
 
 
 class Find(AssertionError):  # noqa: N818
@@ -106,6 +106,9 @@ def _one_worker(
         if line:
             _note(result, json.loads(line))
     os.close(from_child)
+    if status and not struct.unpack("<qdd", shared[:24])[1]:
+        # Nothing was attempted: that says nothing of any seed.
+        raise RuntimeError("the campaign cannot be prepared; what its worker said stands above")
     if status:
         seed = struct.unpack("<qdd", shared[:24])[0]
         what = f"over {limit_s:g} s" if hung == seed else f"the process ended with {status}"
