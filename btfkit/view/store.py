@@ -63,14 +63,15 @@ def coded(small: Thumbnails) -> tuple[str, float]:
 def thumbnails(
     btf: BTF,
     *,
-    texels: int = MOST_TEXELS,
+    texels: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Thumbnails:
-    """As many pairs, as large, as `texels` can carry; read one after the other.
+    """As many pairs, as large, as `texels` (a page's, where None) hold; read one after the other.
 
     Values that are not finite count as nothing in the means.
     """
     n, h, w, _ = btf.shape
+    texels = texels or MOST_TEXELS
     most = max(texels // (min(_LEAST_SIDE, h) * min(_LEAST_SIDE, w)), 1)
     pairs = np.unique(np.linspace(0, n - 1, min(n, most)).astype(np.intp))
     shrink = max(math.sqrt(len(pairs) * h * w / texels), 1.0)

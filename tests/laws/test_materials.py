@@ -176,6 +176,11 @@ def test_save_and_load_give_the_same_answers(model: str, tmp_path: Path) -> None
     loaded = btfkit.load(tmp_path / "m.safetensors")
     assert loaded.spec == fitted(model).spec
     assert loaded.header == fitted(model).header
+    kept, told = loaded.header.coverage, fitted(model).header.coverage
+    assert (kept is None) == (told is None)
+    if kept is not None and told is not None:
+        for name, values in told.arrays().items():
+            np.testing.assert_array_equal(kept.arrays()[name], values)
     for ours, theirs in zip(
         loaded.evaluate(*queries), fitted(model).evaluate(*queries), strict=True
     ):
