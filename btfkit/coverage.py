@@ -91,7 +91,7 @@ class Coverage:
             ValueError: no pair is seen from above the horizon.
         """
         lights, views = (np.asarray(d, np.float32).reshape(-1, 3) for d in (light, view))
-        good = np.isfinite(lights).all(axis=1) & np.isfinite(views).all(axis=1)
+        good = np.logical_and.reduce(np.isfinite(np.hstack([lights, views])), axis=1)
         lights, views = lights[good & (views[:, 2] > 0)], views[good & (views[:, 2] > 0)]
         if not len(lights):
             raise ValueError(f"coverage: none of {len(good)} pairs is seen from above the horizon")
