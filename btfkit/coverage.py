@@ -61,12 +61,27 @@ class Coverage:
                 raise ValueError(f"coverage: {name} has shape {table.shape}; expected (n, 3)")
             if not np.allclose(np.linalg.norm(table, axis=1), 1, atol=0.01):
                 raise ValueError(f"coverage: {name} holds vectors that are not of length 1")
+            # As files hold them: what is written and read again answers the same.
+            object.__setattr__(self, name, table.astype(np.float16).astype(np.float32))
         if self.pairs is not None:
             sizes = (len(self.light), len(self.view))
             if self.pairs.ndim != 2 or self.pairs.shape[1:] != (2,) or not len(self.pairs):
                 raise ValueError(f"coverage: pairs have shape {self.pairs.shape}; expected (n, 2)")
             if (self.pairs < 0).any() or (self.pairs >= sizes).any():
                 raise ValueError(f"coverage: pairs name directions beyond {sizes}")
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all arrays are equal."""
+        if not isinstance(other, Coverage):
+            return NotImplemented
+        mine, theirs = self.arrays(), other.arrays()
+        return mine.keys() == theirs.keys() and all(
+            np.array_equal(array, theirs[name]) for name, array in mine.items()
+        )
+
+    def __hash__(self) -> int:
+        """By what is cheap to look at."""
+        return hash((self.count, len(self.light), len(self.view)))
 
     @staticmethod
     def of(light: ArrayLike, view: ArrayLike) -> Coverage:
@@ -76,7 +91,7 @@ class Coverage:
             ValueError: no pair is seen from above the horizon.
         """
         lights, views = (np.asarray(d, np.float32).reshape(-1, 3) for d in (light, view))
-        good = np.isfinite(lights).all(axis=1) & np.isfinite(views).all(axis=1)
+        good = np.logical_and.reduce(np.isfinite(np.hstack([lights, views])), axis=1)
         lights, views = lights[good & (views[:, 2] > 0)], views[good & (views[:, 2] > 0)]
         if not len(lights):
             raise ValueError(f"coverage: none of {len(good)} pairs is seen from above the horizon")

@@ -156,7 +156,7 @@ def _left(relief: tracer.Geometry, stack: Stack, values: Array) -> float:
     albedo = summed / np.maximum((known * cosine**2).sum(axis=1), 1e-9)
     rays = [[np.broadcast_to(d[k], (len(place), 3)) for d in (stack.light, stack.view)]
             for k in few]  # fmt: skip
-    traced = [tracer.trace(relief, place, *pair, sharp).rgb for pair in rays]
+    traced = [tracer.trace(relief, place, pair[0], pair[1], sharp).rgb for pair in rays]
     measured = np.log1p(np.maximum(np.where(known, true, 0), 0))
     ours, plain = (
         float(np.square((np.log1p(np.maximum(found, 0)) - measured) * known).mean())

@@ -51,7 +51,7 @@ def lobes_of(
     """
     _, m, c = values.shape
     count = c if c in (1, 3) else 1
-    part = values if count == c else values.mean(axis=2, keepdims=True)
+    part: Array = values if count == c else np.asarray(values.mean(axis=2, keepdims=True))
     start = shared(part, light, view)
     sharp = max(1.0, (_OWN_GLOSS_PAIRS / m) ** 2)
     held = (_HELD_SLOPE, HELD[1] * sharp, HELD[2], HELD[3] * sharp)
