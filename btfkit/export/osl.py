@@ -59,6 +59,11 @@ def written(program: Program) -> Written:
             "this material has networks of opacity and offset of its own, which OSL is not "
             "written for; expected one whose rays end at heights or by a network of depth"
         )
+    if isinstance(program.depth, Heights) and program.depth.opacity is not None:
+        raise TypeError(
+            "the heights of this material have holes, which OSL is not written for; expected "
+            "heights without"
+        )
     if program.rounded:
         raise TypeError("networks rounded to bfloat16 have no form in OSL; fit with float32 ones")
     layers = [*program.layers, *getattr(program.depth, "layers", ())]

@@ -138,9 +138,10 @@ def with_sharp_lobes(name: str) -> Any:
     return material.with_lobes(LobeTable.of(finest, grid=material.header.grid, wrap="wrap"))
 
 
-def bumpy(**options: Any) -> SBTF:
-    """An SBTF of random weights over round bumps."""
+def bumpy(*, holes: bool = False) -> SBTF:
+    """An SBTF of random weights over round bumps, or over those with holes between them."""
     spec = NeuMIPSpec((16, 24), levels=1, features=4, heights=True, curved=True, hidden=(8,),
+                      holes=holes, looks=10,
                       directions=("lx", "ly", "lz", "vx", "vy", "vz", "curvature"))  # fmt: skip
     header = Header((16, 24))
     rng = np.random.default_rng(0)
@@ -149,6 +150,8 @@ def bumpy(**options: Any) -> SBTF:
     row, col = np.mgrid[:16, :24]
     bumps = np.sin(2 * np.pi * col / 24) * np.sin(2 * np.pi * row / 16) - 1
     weights["texture.heights"] = (bumps[..., None]).astype(np.float32)
+    if holes:
+        weights["texture.opacity"] = np.clip(bumps[..., None] + 1.4, 0, 1).astype(np.float32)
     return SBTF(spec, weights, header)
 
 
@@ -178,10 +181,11 @@ def test_lobes_are_those_of_the_material(mi: Any) -> None:
     np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=1e-6)
 
 
-def test_bent_rays_answer_as_the_material(mi: Any) -> None:
+@pytest.mark.parametrize("holes", [False, True])
+def test_bent_rays_answer_as_the_material(holes: bool, mi: Any) -> None:
     from btfkit.render.mitsuba.evaluation import Evaluation
 
-    material, rng, n = bumpy(), np.random.default_rng(1), 1000
+    material, rng, n = bumpy(holes=holes), np.random.default_rng(1), 1000
     uv = rng.random((n, 2), np.float32)
     light, view = directions(rng, n), directions(rng, n)
     curvature = rng.choice([0, 0.5, 3, -2], n).astype(np.float32)

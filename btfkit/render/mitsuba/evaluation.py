@@ -85,6 +85,9 @@ class Evaluation:
         self.pyramids = {t.name: Pyramid(t.levels, program.wrap) for t in self._textures}
         if isinstance(found, Heights):
             self._surface = Surface(found.heights, program.wrap)
+            self._holes = None
+            if found.opacity is not None:
+                self._holes = Surface(found.opacity, program.wrap)
         elif found is not None:
             self._offset = Pyramid(found.texture.levels[:1], program.wrap)
 
@@ -197,11 +200,15 @@ class Evaluation:
         if found is None:
             return Met(none, whole, none)
         if isinstance(found, Heights):
+            if self._holes is not None:
+                return on_curved(
+                    found, self._surface, self._holes, uv, view, bent, program.aspect, active
+                )
             flat = on_plane(found, self._surface, uv, view, program.aspect, active)
             if not found.curved:
                 return Met(flat, whole, none)
             bends = active & (bent != 0)
-            met = on_curved(found, self._surface, uv, view, bent, program.aspect, bends)
+            met = on_curved(found, self._surface, None, uv, view, bent, program.aspect, bends)
             return Met(
                 *(dr.select(bends, a, b) for a, b in zip(met, (flat, whole, none), strict=True))
             )

@@ -10,13 +10,14 @@ import mitsuba as mi
 
 from btfkit.conventions import (
     CURVED_FINER,
-    CURVED_LOOKS,
     LOOKS,
     LOWEST_COSINE,
     MOST_BEND,
+    SLACK,
     STEEPEST,
     displacement,
 )
+from btfkit.native.neural.bent import hole_range
 from btfkit.program import Heights
 
 Numbers = list[Any]
@@ -62,13 +63,14 @@ def on_plane(
 def on_curved(
     found: Heights,
     surface: Lookup,
+    holes: Lookup | None,
     uv: Numbers,
     view: Numbers,
     curvature: Any,
     aspect: float,
     active: Any,
 ) -> Met:
-    """As `native.neural.bent.meet`."""
+    """As `native.neural.bent.meet`; `holes` looks up the heights' opacity, where they have one."""
     h, w = found.heights.shape
     scale = float(found.scale)
     top = max(float(found.heights.max()), 0.0)
@@ -90,19 +92,26 @@ def on_curved(
     along = displacement(-view[0], -view[1], flat / scale, aspect)
     share = dr.maximum(z, LOWEST_COSINE) / flat
 
+    # Where there are holes the ray may pass although it reaches the bottom.
+    sure = reaches if holes is None else mi.Bool(False)
+
     def above(way: Any, looks: Any) -> Any:
-        height = _height_at(bend, sine, cosine, way)
-        return height - surface(uv[0] + way * along[0], uv[1] + way * along[1], looks)
+        u, v = uv[0] + way * along[0], uv[1] + way * along[1]
+        gap = _height_at(bend, sine, cosine, way) - surface(u, v, looks)
+        if holes is None:
+            return gap
+        rise = hole_range(found)
+        return dr.maximum(gap - SLACK * rise, (0.5 - holes(u, v, looks)) * rise)
 
     reach = stop - start
     texels = reach * dr.maximum(dr.abs(along[0]) * w, dr.abs(along[1]) * h)
-    texels = texels * dr.select(reaches, 1, CURVED_FINER)
-    count = dr.clip(dr.ceil(texels), 1, dr.select(reaches, mi.Float(LOOKS), CURVED_LOOKS))
+    texels = texels * dr.select(sure, mi.Float(1), CURVED_FINER)
+    count = dr.clip(dr.ceil(texels), 1, dr.select(sure, mi.Float(LOOKS), found.looks))
     way, under = _march(
         lambda k: start + reach * dr.minimum(k / count, 1), above, start, count,
-        active=active, most=CURVED_LOOKS, limited=True,
+        active=active, most=max(found.looks, LOOKS), limited=True,
     )  # fmt: skip
-    opaque = reaches | (under <= 0)
+    opaque = sure | (under <= 0)
     way = dr.select(opaque, way, stop)
     return Met(-way * share * scale, dr.select(opaque, mi.Float(1), 0), bend * way)
 
