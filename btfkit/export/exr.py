@@ -98,5 +98,6 @@ def _mips(name: str, levels: tuple[NDArray[Any], ...], folder: Path) -> list[str
 
 
 def _numbers(values: NDArray[Any]) -> list[float]:
-    """Decimal numbers that are read as the same float32."""
-    return [float(str(value)) for value in np.asarray(values, np.float32).reshape(-1)]
+    """Decimal numbers that are read as the same float32, however numpy is set to print."""
+    flat = np.asarray(values, np.float32).reshape(-1)
+    return [float(np.format_float_scientific(value, unique=True)) for value in flat]

@@ -111,6 +111,7 @@ class _Writer:
         if isinstance(found, Heights):
             self.textures["btfkit_heights"] = np.repeat(found.heights[..., None], 3, axis=2)
             return ["return btfkit_march(btfkit_heights, u, v, view);"]
+        assert not isinstance(found, OffsetNetwork)  # `written` refuses it
         lines, values = self._looked(found.texture, "u", "v", "0.0")
         known = dict(_INPUTS) | values
         lines = ["vector light = view;", *_HALF, *_discs(found.inputs), *lines]
@@ -233,7 +234,7 @@ def _layers(name: str, layers: Sequence[Dense], x: list[str]) -> tuple[list[str]
         for o, (row, bias) in enumerate(zip(layer.weight, layer.bias, strict=True)):
             terms = [
                 literal(bias),
-                *(f"{literal(w)}*{v}" for w, v in zip(row, x, strict=True) if w),
+                *(f"{literal(number)}*{v}" for number, v in zip(row, x, strict=True) if number),
             ]
             lines.append(f"float {own[o]} = {' + '.join(terms)};")
         if layer.gain is not None and layer.centre is not None:
@@ -243,10 +244,10 @@ def _layers(name: str, layers: Sequence[Dense], x: list[str]) -> tuple[list[str]
             lines.append(f"float {scale} = 1.0 / sqrt(({squares}) / {n} + {literal(EPSILON)});")
             lines += [f"{o} = ({o} - {mean}) * {scale} * {literal(g)} + {literal(c)};"
                       for o, g, c in zip(own, layer.gain, layer.centre, strict=True)]  # fmt: skip
-        for o, before in zip(own, x if layer.residual else [""] * len(own), strict=True):
-            value = o if layer.omega == 1 else f"({literal(layer.omega)} * {o})"
+        for to, before in zip(own, x if layer.residual else [""] * len(own), strict=True):
+            value = to if layer.omega == 1 else f"({literal(layer.omega)} * {to})"
             value = _ACTIVATED[layer.activation].format(value)
-            lines.append(f"{o} = {before} + {value};" if before else f"{o} = {value};")
+            lines.append(f"{to} = {before} + {value};" if before else f"{to} = {value};")
         x = own
     return lines, x
 

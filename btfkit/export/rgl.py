@@ -57,7 +57,7 @@ def write(
     luminance = np.zeros((len(phi), len(theta), size, size), np.float32)
     for p, azimuth in enumerate(phi):
         for t, polar in enumerate(theta):
-            light = directions.from_angles(polar, azimuth)
+            light = np.asarray(directions.from_angles(polar, azimuth), np.float64)
             half, jacobian = _half_vectors(size, azimuth if isotropic else 0.0)
             across = half @ light
             view = 2 * across[:, None] * half - light
@@ -99,5 +99,5 @@ def _half_vectors(size: int, azimuth: float) -> tuple[Floats, Floats]:
     phi = (2 * u - 1) * np.pi + azimuth
     rows, cols = np.meshgrid(phi, theta, indexing="ij")
     jacobian = np.maximum(2 * np.pi**2 * u * np.sin(theta), 1e-6)
-    half = directions.from_angles(cols.ravel(), rows.ravel())
+    half = np.asarray(directions.from_angles(cols.ravel(), rows.ravel()), np.float64)
     return half, np.tile(jacobian, size)

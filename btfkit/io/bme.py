@@ -160,12 +160,16 @@ def _read(path: Path) -> _Part:
     if not text.endswith("\n"):
         warnings.warn(f"{path} ends within a line: it may have been cut", stacklevel=4)
     turn = 90 - head.upphi
-    view = directions.from_angles(np.radians(table[:, 0]), np.radians(table[:, 1] + turn))
+    view = np.asarray(
+        directions.from_angles(np.radians(table[:, 0]), np.radians(table[:, 1] + turn)), np.float64
+    )
     front = view[:, 2] > _LOWEST
     value = table[front, 2:]
     if _KINDS[head.kind]:
         value = value / view[front, 2:]
-    light = directions.from_angles(np.radians(head.intheta), np.radians(head.inphi + turn))
+    light = np.asarray(
+        directions.from_angles(np.radians(head.intheta), np.radians(head.inphi + turn)), np.float64
+    )
     return _Part(light, view[front], value, head.sample, int((~front).sum()))
 
 

@@ -102,7 +102,7 @@ def read(
                 remedy="--direction-residual raises it",
             )
         placed[f"{name}_position"] = position.astype(np.float32)
-        far[name] = directions.normalize(position)
+        far[name] = np.asarray(directions.normalize(position), np.float64)
         stated[f"{name}_residual_deg"] = {
             "largest": float(residual.max()), "mean": float(residual.mean()),
         }  # fmt: skip
@@ -234,7 +234,8 @@ def _units(path: Path, name: str, flat: NDArray[np.float64]) -> NDArray[np.float
             f"the {name} of image {at[0]} is {flat[at].tolist()}; expected x, y of a unit vector",
         )
     z = np.sqrt(np.maximum(1 - square, 0))
-    return directions.normalize(np.concatenate([flat, z[..., None]], axis=-1))
+    whole = np.concatenate([flat, z[..., None]], axis=-1)
+    return np.asarray(directions.normalize(whole), np.float64)
 
 
 def _positions(

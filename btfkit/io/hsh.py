@@ -79,7 +79,8 @@ def load(path: Path, *, upward: bool = False) -> HSH:
     """
     with path.open("rb") as file:
         head = file.read(_MOST_HEAD)
-    lines, at = [], 0
+    lines: list[str] = []
+    at = 0
     while len(lines) < 4:
         end = head.find(b"\n", at)
         if end < 0:

@@ -59,7 +59,7 @@ def read(path: Path, *, sampling: str | None = None) -> BTF:
     light, view = table[pairs[:, 0]], table[pairs[:, 1]]
     measured = Measured.of(path, tensorfile.read(path))
     brdf = measured.brdf(light, view)
-    usable = ((brdf >= 0) & (brdf < MOST)).all(axis=1)
+    usable: NDArray[np.bool_] = np.all((brdf >= 0) & (brdf < MOST), axis=1)
     if usable.mean() < _FEWEST_VALID:
         raise FormatError(path, f"{(~usable).mean():.0%} of the values are negative or not finite")
     quantity = np.where(usable[:, None], np.pi * brdf * light[:, 2:], np.nan)
@@ -151,7 +151,7 @@ class Measured:
     def brdf(self, light: Floats, view: Floats) -> Floats:
         """(n, c) f_r under lights and views (n, 3) above the horizon."""
         light, view = self._reduced(light, view)
-        half = directions.normalize(light + view)
+        half = np.asarray(directions.normalize(light + view), np.float64)
         theta, phi = _angles(light)
         theta_m, phi_m = _angles(half)
         place = np.stack([_of_theta(theta_m), _of_phi(phi_m - phi if self.isotropic else phi_m)])
@@ -191,7 +191,7 @@ def _ascending(path: Path, name: str, values: NDArray[Any]) -> Floats:
 
 
 def _angles(unit: Floats) -> tuple[Floats, Floats]:
-    theta, _ = directions.to_angles(unit)
+    theta = np.asarray(directions.to_angles(unit)[0], np.float64)
     return theta, np.arctan2(unit[:, 1], unit[:, 0])
 
 

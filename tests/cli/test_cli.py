@@ -18,7 +18,7 @@ from btfkit.btf import BTF
 from btfkit.cli import VERBS, btfkit
 from btfkit.cli.options import DurationType, SettingType, SliceType, WindowType
 from btfkit.cli.outcome import run
-from btfkit.io.store import writer
+from btfkit.io.store import places, writer
 from btfkit.jsonvalues import plain
 
 ENTRY = str(Path(sys.executable).with_name("btfkit"))
@@ -133,7 +133,7 @@ def test_a_full_disk_is_an_error_of_its_own(
     def full(path: Path) -> None:
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr(writer, "to_disk", full)
+    monkeypatch.setattr(places, "to_disk", full)
     assert call("ingest", store, "-o", tmp_path / "b.btf.zarr") == 1
     assert "No space left on device" in capsys.readouterr().err
     assert not (tmp_path / "b.btf.zarr").exists()

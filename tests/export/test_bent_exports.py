@@ -110,7 +110,7 @@ def test_the_header_follows_bent_rays(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("target", sorted(set(TARGETS) - {*ASKED, *FOLLOW}))
 def test_the_others_name_those_that_do(target: str, tmp_path: Path) -> None:
-    with pytest.raises(TypeError, match=rf"which {target} does not follow; npz, cpp, glsl do"):
+    with pytest.raises(TypeError, match=rf"which {target} does not follow; npz, exr, cpp, glsl do"):
         export(made("sbtf"), target, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

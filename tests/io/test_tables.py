@@ -116,7 +116,7 @@ def test_light_positions_between_bare_commas_are_refused(tmp_path: Path) -> None
 
 def test_no_locale_decides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (pictures(tmp_path) / "manifest.csv").write_text(table(";", comma=True))
-    before = btfkit.open(tmp_path).light
+    before, kept = btfkit.open(tmp_path).light, locale.setlocale(locale.LC_ALL)
     for name in ("de_DE.UTF-8", "fr_FR.UTF-8", "C"):
         monkeypatch.setenv("LC_ALL", name)
         try:
@@ -124,4 +124,4 @@ def test_no_locale_decides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         except locale.Error:
             continue
         np.testing.assert_array_equal(btfkit.open(tmp_path).light, before)
-    locale.setlocale(locale.LC_ALL, "C")
+    locale.setlocale(locale.LC_ALL, kept)

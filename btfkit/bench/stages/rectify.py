@@ -7,6 +7,7 @@ signal to noise against the mean over a texel's area, and against its Gaussian o
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -59,8 +60,8 @@ def _at(texels: int, tilt_deg: float, rng: np.random.Generator) -> list[dict[str
     rows = np.arange(150 - 140 // FINE * FINE, 150 + span + 140, FINE)
     frame = _integrated(fine, rows, columns).astype(np.float32)[..., None]
     middle = 150 + (np.arange(texels) + 0.5) * SCALE * FINE
-    place = np.meshgrid((middle - columns[0]) / wide - 0.5, (middle - rows[0]) / FINE - 0.5)
-    place = np.stack(place, -1).reshape(-1, 2)
+    grid = np.meshgrid((middle - columns[0]) / wide - 0.5, (middle - rows[0]) / FINE - 0.5)
+    place: Floats = np.stack(grid, axis=-1).reshape(-1, 2)
     slope = np.diag([SCALE * np.cos(tilt), SCALE])
     edges = 150 + np.arange(texels + 1) * SCALE * FINE
     area_truth = _integrated(fine, edges, edges)
@@ -70,7 +71,7 @@ def _at(texels: int, tilt_deg: float, rng: np.random.Generator) -> list[dict[str
     extra = np.maximum(0.25 * np.diag(slope) ** 2 - 1 / 12, 0.25)
     packed = np.array([resample.KEPT / extra[0], 0, resample.KEPT / extra[1]], np.float32)
     count = len(place)
-    methods = {
+    methods: dict[str, Callable[[], Any]] = {
         "bilinear": lambda: ndimage.map_coordinates(frame[..., 0], place[:, ::-1].T, order=1),
         "area": lambda: (
             resample.area(

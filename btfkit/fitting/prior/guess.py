@@ -147,7 +147,8 @@ def _left(relief: tracer.Geometry, stack: Stack, values: Array) -> float:
     """The error of a relief's answers for some of its own pairs, in parts of Lambert's."""
     few = spread(stack.light, _LOOKED_AT)
     rows, cols, _, c = values.shape
-    place = np.stack(np.mgrid[:rows, :cols][::-1], axis=-1).reshape(-1, 2).astype(np.float32)
+    down, across = np.mgrid[:rows, :cols]
+    place = np.stack([across, down], axis=-1).reshape(-1, 2).astype(np.float32)
     sharp = np.full(len(place), 0.5, np.float32)
     true = values[:, :, few].reshape(-1, len(few), c)
     known = np.isfinite(true)

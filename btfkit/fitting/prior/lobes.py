@@ -55,8 +55,10 @@ def lobes_of(
     start = shared(part, light, view)
     sharp = max(1.0, (_OWN_GLOSS_PAIRS / m) ** 2)
     held = (_HELD_SLOPE, HELD[1] * sharp, HELD[2], HELD[3] * sharp)
-    weight = np.isfinite(values).all(axis=2).astype(np.float32)
-    rays = [far if by is None else by for far, by in zip((light, view), near, strict=True)]
+    weight: Array = np.asarray(np.isfinite(values).all(axis=2), np.float32)
+    rays: list[Array] = [
+        far if by is None else by for far, by in zip((light, view), near, strict=True)
+    ]
     are_near = near[0] is not None, near[1] is not None
 
     def fit(values: Array, start: Start, *, free: bool) -> Lobes:

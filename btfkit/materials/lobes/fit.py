@@ -69,8 +69,8 @@ def fit(places: Places, answers: Answers, *, grid: tuple[int, int], wrap: Wrap) 
         table = _stepped(table, _drawn(table, size, wrap, places, answers, rng))
     table = _chosen(table, _drawn(table, size, wrap, places, answers, rng), size, wrap)
     # As files hold them: what is read is what was fitted.
-    halves = table.reshape(*size, 5).astype(np.float16)
-    return LobeTable.of(halves, grid=grid, wrap=wrap)
+    kept = table.reshape(*size, 5).astype(np.float16).astype(np.float32)
+    return LobeTable.of(kept, grid=grid, wrap=wrap)
 
 
 def cells(grid: tuple[int, int]) -> tuple[int, int]:
@@ -176,10 +176,10 @@ def _chosen(table: Floats, drawn: _Drawn, size: tuple[int, int], wrap: Wrap) -> 
             for grazing in _SHARES if share else (0.0,):
                 part = np.where(facing > LEAST_FACING, share + (grazing - share) * schlick, 0)
                 mixed = (1 - part) * cosine + part * gloss
-                cost = np.bincount(
+                spent: Floats = np.bincount(
                     drawn.cell, square / np.maximum(mixed, 1e-9), minlength=len(table)
                 )
-                cost = _around(cost.reshape(size), wrap).reshape(-1) * (_WORTH if share else 1)
+                cost = _around(spent.reshape(size), wrap).reshape(-1) * (_WORTH if share else 1)
                 less = cost < best
                 best = np.where(less, cost, best)
                 found[less, 2:] = np.stack(

@@ -212,6 +212,7 @@ class Evaluation:
             return Met(
                 *(dr.select(bends, a, b) for a, b in zip(met, (flat, whole, none), strict=True))
             )
+        assert not isinstance(found, OffsetNetwork)  # refused when this was made
         psi = self._offset(uv[0], uv[1], 0 * uv[0], active)
         columns = _known(view, view, level, none)
         columns |= dict(zip(found.texture.features, psi, strict=True))

@@ -5,11 +5,13 @@ What `materials.measured.interpolation` answers of lists in which all views have
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, final
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from btfkit.materials.base import Material
 from btfkit.materials.measured.interpolation import GRAZING, Interpolation
@@ -46,6 +48,8 @@ class Measured:
     """
 
     curved = passes = False
+    # No textures of it can be differentiated.
+    pyramids: Mapping[str, Any] = {}
 
     def __init__(self, material: Material) -> None:
         if not isinstance(material, Interpolation):
@@ -68,7 +72,7 @@ class Measured:
         texels = np.zeros((n, h, w, 4), np.float32)
         for k in range(n):
             values = material.texture(k)
-            good = np.isfinite(values).all(axis=2)
+            good: NDArray[np.bool_] = np.all(np.isfinite(values), axis=2)
             texels[k, ..., : self._count] = np.where(good[..., None], values, 0) @ to
             texels[k, ..., 3] = good
         self._texels = mi.Float(texels.reshape(-1))

@@ -70,7 +70,7 @@ class Pointwise:
         return self.passes and bool(ctx.is_enabled(mi.BSDFFlags.Null, 1))
 
     def _query(self, si: Any) -> dict[str, Any]:
-        asked = {"uv": self._asked.uv(si), "view": [si.wi.x, si.wi.y, si.wi.z]}
+        asked: dict[str, Any] = {"uv": self._asked.uv(si), "view": [si.wi.x, si.wi.y, si.wi.z]}
         asked["footprint"] = self._asked.footprint(si) if self._material.has_levels else 0.5
         return asked
 

@@ -12,7 +12,7 @@ from btfkit.materials.base import Material
 from btfkit.materials.measured.interpolation import Interpolation
 from btfkit.render.mitsuba import lobes as lobes_
 from btfkit.render.mitsuba.asked import Asked
-from btfkit.render.mitsuba.evaluation import Evaluation, Seen
+from btfkit.render.mitsuba.evaluation import Evaluation
 from btfkit.render.mitsuba.measured import Measured
 
 
@@ -87,7 +87,7 @@ class Traced:
             return mi.Spectrum(0)
         return mi.Spectrum(1 - self._cover(si, self._seen(si, active), active)) & active
 
-    def _seen(self, si: Any, active: Any) -> Seen:
+    def _seen(self, si: Any, active: Any) -> Any:
         """What lights of a view share; of equal arguments Dr.Jit computes it once."""
         active = active & (si.wi.z > 0)
         u, v = self._asked.uv(si)
@@ -99,18 +99,18 @@ class Traced:
         bent = self._asked.curvature(si, active) if self._evaluation.curved else 0.0
         return self._evaluation.seen(uv, view, self._asked.footprint(si), active, bent)
 
-    def _lobe(self, si: Any, seen: Seen, active: Any) -> lobes_.Drawn:
+    def _lobe(self, si: Any, seen: Any, active: Any) -> lobes_.Drawn:
         active = active & (si.wi.z > 0)
         place = self._evaluation.place(seen)
         return self._lobes(place, si.wi, self._asked.footprint(si), active)
 
-    def _density(self, ctx: Any, seen: Seen, lobe: Any, wo: Any, active: Any) -> Any:
+    def _density(self, ctx: Any, seen: Any, lobe: Any, wo: Any, active: Any) -> Any:
         found = lobes_.pdf(lobe, wo, mi.Vector3f(*seen.view))
         if self.passes and ctx.is_enabled(mi.BSDFFlags.Null, 1):
             found *= self._evaluation.opacity(seen, active)
         return dr.select(active & (seen.view[2] > 0), found, 0)
 
-    def _value(self, seen: Seen, wo: Any, active: Any) -> Any:
+    def _value(self, seen: Any, wo: Any, active: Any) -> Any:
         lit = active & (seen.view[2] > 0) & (wo.z > 0)
         found, cover = self._evaluation.answer(seen, [wo.x, wo.y, wo.z], lit)
         rgb = [sum(m[k] * x for m, x in zip(self._rgb, found, strict=True) if m[k])
@@ -118,6 +118,6 @@ class Traced:
         value = mi.Spectrum(*rgb) * (cover / math.pi if self.passes else 1 / math.pi)
         return value & lit
 
-    def _cover(self, si: Any, seen: Seen, active: Any) -> Any:
+    def _cover(self, si: Any, seen: Any, active: Any) -> Any:
         """Opacity; from behind there is nothing: what passed it leaves the body as it came."""
         return dr.select(si.wi.z > 0, self._evaluation.opacity(seen, active), 0)
