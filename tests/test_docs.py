@@ -32,7 +32,8 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
                 exec(compile("".join(cell["source"]), cell["id"], "exec"), scope)
     # What it says at its end is what the fit said of the same pairs.
     assert scope["psnr"] == pytest.approx(scope["report"].errors["psnr"], abs=0.01)
-    assert scope["psnr"] > 25
+    # Eight components explain it to 25 dB; what is wrong in kind ends below 20.
+    assert scope["psnr"] > 23
     matplotlib.pyplot.close("all")
 
 

@@ -157,7 +157,8 @@ def read_stack(btf: BTF, *, progress: Progress | None = None) -> Stack:
     unmeasured = saturated = 0
     for start in range(0, len(chosen), 8):
         run = slice(start, min(start + 8, len(chosen)))
-        images = btf.batch(chosen[run])
+        # A copy: textures in memory are given as they lie there.
+        images = np.array(btf.batch(chosen[run]), np.float32)
         unmeasured += int((~np.isfinite(images)).any(axis=-1).sum())
         saturated += _leave_out_clipped(images)
         values[:, :, run] = images.transpose(1, 2, 0, 3)

@@ -172,14 +172,17 @@ def test_derivatives_of_a_tilting_turning_sample_and_the_optimum_are_those_of_au
     jacobians = torch.autograd.functional.jacobian(residuals, given)
     problem = Problem(best, seen, (), slip_sd={})
     ours, slopes = problem.evaluate(np.zeros(problem.size))
+    # Behind the corners stands what the drawing says of the axes.
+    corners = len(residual)
     scale = problem.sd_px("corner")
-    np.testing.assert_allclose(ours * scale, residual, atol=1e-9)
-    slopes = slopes.toarray() * scale[:, None]
+    np.testing.assert_allclose(ours[:corners] * scale, residual, atol=1e-9)
+    slopes = slopes.toarray()[:corners] * scale[:, None]
     # 1e-8 of pixels a unit: both are float64
     np.testing.assert_allclose(slopes[:, :9], jacobians[0].numpy(), rtol=1e-8, atol=1e-7)
     np.testing.assert_allclose(slopes[:, 12:15], jacobians[1].numpy()[:, 3:], rtol=1e-8, atol=1e-7)
     # At the optimum no free parameter of the other formulation has a slope left either, beside
-    # what one standard deviation of it would cost.
+    # what one standard deviation of it would cost, and what the drawing of the axes, which counts
+    # as an observation of its own, holds against it (4e-5 here).
     for index, held in (
         (0, [i for i, n in enumerate(problem.names[:9]) if n in found.held]),
         (2, []),
@@ -188,7 +191,7 @@ def test_derivatives_of_a_tilting_turning_sample_and_the_optimum_are_those_of_au
         slope = jacobian.T @ residual
         size = np.linalg.norm(jacobian, axis=0) * np.linalg.norm(residual)
         slope[held] = 0
-        assert (np.abs(slope) < 1e-5 * size).all()
+        assert (np.abs(slope) < 1e-4 * size).all()
 
 
 @pytest.mark.parametrize("slip_sd", [{}, {"tilt": 1e-3, "turn": 2e-3}])

@@ -439,8 +439,8 @@ def test_the_verb_calibrates_a_sequence_and_keeps_what_it_knows(folder, capsys):
     assert f"next: btfkit ingest {folder}\n" in said.err
     out = folder.parent / "other.json"
     assert call("calibrate", folder, "-o", out) == 0
-    # What lies elsewhere is not read along with the sequence.
-    assert "next:" not in capsys.readouterr().err
+    # What lies elsewhere is named to be read along with the sequence.
+    assert f"next: btfkit ingest {folder} --calibration {out}\n" in capsys.readouterr().err
     assert call("calibrate", folder, "-o", out) == 1
     assert "exists; --force" in capsys.readouterr().err
 

@@ -55,7 +55,7 @@ class Pointwise:
             return found, mi.Spectrum(1 if reflected else 1 - cover)
         if si.wi.z <= 0:
             return found, mi.Spectrum(0)
-        random = [min(sample1 / max(cover, 1e-6), 1), sample2.x, sample2.y]
+        random = [min(sample1 / max(cover, 1e-6), 1), sample2[0], sample2[1]]
         light, _ = self._material.sample(random=random, **self._query(si))
         found.wo = mi.Vector3f(*light.tolist())
         found.pdf = self.pdf(ctx, si, found.wo)
