@@ -121,7 +121,7 @@ def load(path: str | os.PathLike[str]) -> Material:
         if table is None:
             return material
         return material.with_lobes(LobeTable.of(table, grid=header.grid, wrap=header.wrap))
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise FormatError(path, f"the header does not describe a material: {error}") from error
 
 
@@ -153,7 +153,10 @@ def header_of(path: str | os.PathLike[str]) -> dict[str, Any]:
     decoded: dict[str, Any] = {"model": metadata["model"], "shapes": shapes}
     for name in ("spec", *_FIELDS):
         if name in metadata:
-            decoded[name] = json.loads(metadata[name])
+            try:
+                decoded[name] = json.loads(metadata[name])
+            except (ValueError, RecursionError) as error:
+                raise FormatError(path, f"{name} is no JSON to be read: {error}") from error
     decoded["model"] = present_name(metadata["model"], decoded.get("spec", {}))
     return decoded
 
