@@ -14,7 +14,6 @@ from typing import Any, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from btfkit import directions
 
@@ -249,6 +248,9 @@ class _Spots:
     """Points (n, 3 or 6) on one sphere or two, each with how far it reaches."""
 
     def __init__(self, points: Floats) -> None:
+        # Here, because a material is loaded and answers without it, and it takes half a second.
+        from scipy.spatial import cKDTree
+
         self._tree = cKDTree(points.astype(float))
         k = min(_NEIGHBOURS, len(points) - 1)
         reach = np.full(len(points), _LEAST)

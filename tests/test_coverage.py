@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -173,3 +175,18 @@ SAID = {
 @pytest.mark.parametrize("kind", SAID)
 def test_what_is_said_of_it(kind: str) -> None:
     assert Coverage.of(*KINDS[kind]).said() == SAID[kind]
+
+
+def test_a_material_is_loaded_and_answers_without_scipy(tmp_path: Path) -> None:
+    header = Header((4, 4), coverage=Coverage.of(UP, UP))
+    texture = {"texture": np.ones((4, 4, 3), np.float32)}
+    file.save(Lambert(LambertSpec((4, 4), 3), texture, header), tmp_path / "m.safetensors")
+    code = (
+        "import sys, btfkit; found = btfkit.load(sys.argv[1])\n"
+        "found.evaluate([0.5, 0.5], [0, 0, 1], [0, 0, 1]); print('scipy' in sys.modules)"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "m.safetensors")],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert run.stdout.split() == ["False"]

@@ -73,13 +73,17 @@ def described(path: Location) -> dict[str, Any]:
     if kind == "model" and isinstance(path, Path):
         from btfkit.coverage import UNKNOWN
         from btfkit.materials.explained import explained
-        from btfkit.materials.file import coverage_of, header_of
+        from btfkit.materials.file import header_of
 
-        header, coverage = header_of(path), coverage_of(path)
-        measured = UNKNOWN if coverage is None else coverage.described()
-        made = explained(sources.material(path))
-        size = path.stat().st_size
-        return {"kind": kind, "bytes": size, "coverage": measured, "made_of": made, **header}
+        header, material = header_of(path), sources.material(path)
+        coverage = material.header.coverage
+        return {
+            "kind": kind,
+            "bytes": path.stat().st_size,
+            "coverage": UNKNOWN if coverage is None else coverage.described(),
+            "made_of": explained(material),
+            **header,
+        }
     found = sources.measured(path)
     if isinstance(found, BTF):
         return {"kind": kind, "path": path, **_of_btf(found)}

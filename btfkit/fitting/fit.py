@@ -17,7 +17,7 @@ from btfkit.btf import BTF
 from btfkit.coverage import Coverage
 from btfkit.errors import FitError, unknown
 from btfkit.files import refuse_existing
-from btfkit.fitting import CLOSED_FORM, MODELS, TAUGHT, TRACED, loaded
+from btfkit.fitting import CLOSED_FORM, MODELS, TAUGHT, TRACED, gains, loaded
 from btfkit.fitting.phases import Phases, Told
 from btfkit.fitting.reading import masked, read_once
 from btfkit.fitting.report import FitReport
@@ -28,7 +28,7 @@ from btfkit.materials.base import Material
 from btfkit.materials.evaluation import errors_on_btf, errors_on_queries
 from btfkit.queries import QuerySet
 from btfkit.relief.relief import Relief
-from btfkit.settings import as_text, truth
+from btfkit.settings import as_text
 
 _DEVICES = ("auto", "cpu", "cuda")
 
@@ -106,7 +106,7 @@ def fit(
         said = f"starting took {phases.seconds['starting']:.0f} s of a budget of {budget_s:g} s"
         choice = (*choice, f"{said}: training had its least share, and ended late")
     if _cpu_alone(chosen, run.device, device):
-        what = f"{chosen} with gains" if truth("gains", given.get("gains", "false")) else chosen
+        what = f"{chosen} with gains" if gains.asked_for(given) else chosen
         choice = (*choice, f"trained on the CPU: {what} cannot use a GPU")
     provenance = _provenance(data, plan, given, run)
     if teacher is not None:
@@ -124,8 +124,7 @@ def fit(
     errors: Mapping[str, Any] = {}
     try:
         limit = None if full_report else phases.evaluating_s()
-        gains = truth("gains", given.get("gains", "false"))
-        errors = _errors(material, data, plan, limit, progress, gains=gains)
+        errors = _errors(material, data, plan, limit, progress, gains=gains.asked_for(given))
         if "psnr_carried" in run.stated and "psnr" in errors:
             errors = {**errors, "psnr_own": errors["psnr"]}
         errors = {**errors, **run.stated}

@@ -87,6 +87,11 @@ class GainedTextures(Textures):
         return uv, rays[0], rays[1]
 
 
+def asked_for(settings: Mapping[str, str]) -> bool:
+    """Whether `gains=true` is among settings."""
+    return truth("gains", settings.get("gains", "false"))
+
+
 def wanted(settings: Mapping[str, str], model: str, source: BTF | QuerySet) -> bool:
     """Whether `gains=true` is among the settings.
 
@@ -94,7 +99,7 @@ def wanted(settings: Mapping[str, str], model: str, source: BTF | QuerySet) -> b
         ValueError: not true or false, or a model that cannot tell gains.
         FitError: the data are queries.
     """
-    if not truth("gains", settings.get("gains", "false")):
+    if not asked_for(settings):
         return False
     if model in _NO_GAINS:
         raise ValueError(f"{model} cannot tell gains: {_NO_GAINS[model]}; leave gains out")

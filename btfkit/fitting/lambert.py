@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import final
 
@@ -64,17 +64,34 @@ def lambert(
 
 
 def _of_images(btf: BTF, progress: Callable[[int, int], None] | None) -> Sums:
-    """Sums of value x cosine and of cosine^2, each (h, w, c)."""
-    product, square = np.zeros(btf.shape[1:]), np.zeros(btf.shape[1:])
-    for pair in range(len(btf)):
-        cosine = np.maximum(btf.light_at(pair)[..., 2:].astype(float), 0)
-        if cosine.any():
-            image = btf.texture(pair)
-            measured = np.isfinite(image)
-            product += np.where(measured, image, 0) * cosine
-            square += measured * np.square(cosine)
-        if progress:
-            progress(pair + 1, len(btf))
+    """`sums` of all pairs that light reaches."""
+
+    def lit() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float64]]]:
+        for pair in range(len(btf)):
+            cosine = np.maximum(btf.light_at(pair)[..., 2:].astype(float), 0)
+            if cosine.any():
+                yield btf.texture(pair), cosine
+            if progress:
+                progress(pair + 1, len(btf))
+
+    return sums(lit(), btf.shape[1:])
+
+
+def sums(
+    images: Iterable[tuple[NDArray[np.float32], float | NDArray[np.float64]]],
+    shape: tuple[int, ...],
+) -> Sums:
+    """Sums of value x cosine and of cosine^2, each (h, w, c), over what is measured.
+
+    Args:
+        images: (h, w, c) values, NaN where not measured, and the cosine of their light.
+        shape: h, w, c.
+    """
+    product, square = np.zeros(shape), np.zeros(shape)
+    for image, cosine in images:
+        measured = np.isfinite(image)
+        product += np.where(measured, image, 0) * cosine
+        square += measured * np.square(cosine)
     return product, square
 
 

@@ -77,7 +77,7 @@ class FitReport:
         if self.interrupted:
             line += "; interrupted"
         coverage = self.material.header.coverage
-        guessed = [] if coverage is None or coverage.dense else [coverage.said()]
+        guessed = [] if coverage is None else filter(None, [coverage.said()])
         return "\n  ".join([line, *self._gains(), *(f"not trained: {part}"
                             for part in self.untrained), *guessed, *self.choice])  # fmt: skip
 

@@ -112,7 +112,6 @@ def begun(
     Args:
         generators: `loop.Generators`. more: what the trainable takes beside.
     """
-    from btfkit.fitting import gains
     from btfkit.fitting.alternating import Gained
 
     finds = gains.wanted(settings, model, source)

@@ -27,7 +27,7 @@ from btfkit import colour, directions
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.io import named
-from btfkit.textures import as_textures
+from btfkit.io.brdf import one_texel
 
 SUFFIXES = (".bme", ".dat", ".txt")
 _KINDS = {"DSF": True, "BSDF": False, "BRDF": False}
@@ -81,23 +81,14 @@ def read(path: Path) -> BTF:
     quantity[bad] = np.nan
     if bad.all():
         raise FormatError(path, "none of its values is finite")
-    return named.assembled(
-        path,
-        as_textures(quantity[:, None, None].astype(np.float32)),
-        light=light,
-        view=view,
-        wrap="wrap",
-        provenance={
-            "source": str(path),
-            "format": "bme",
-            "sample": parts[0].sample,
-            "incident_directions": len(parts),
-            "transmission_left_out": sum(part.behind for part in parts),
-            "averaged": again,
-            "invalid_pairs": int(bad.sum()),
-            **record,
-        },
-    )
+    said = {
+        "sample": parts[0].sample,
+        "incident_directions": len(parts),
+        "transmission_left_out": sum(part.behind for part in parts),
+        "averaged": again,
+        **record,
+    }
+    return one_texel(path, quantity, light, view, name="bme", said=said)
 
 
 @final

@@ -21,6 +21,7 @@ from btfkit import directions, nearfield
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.io import named
+from btfkit.io.magic import begins
 from btfkit.textures import Array, Textures
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -39,10 +40,7 @@ _MOST_BYTES = 1 << 31
 
 def detect(path: Path) -> bool:
     """Whether a file is HDF5 by its first bytes and named like it."""
-    if not path.is_file() or path.suffix.lower() not in SUFFIXES:
-        return False
-    with path.open("rb") as file:
-        return file.read(len(_MAGIC)) == _MAGIC
+    return path.suffix.lower() in SUFFIXES and begins(path, _MAGIC)
 
 
 def read(

@@ -24,6 +24,7 @@ from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.io import relit
+from btfkit.io.magic import begins
 
 _MAGIC = b"#HSH1."
 _TERMS = (1, 4, 9, 16)
@@ -32,10 +33,7 @@ _MOST_HEAD = 4096
 
 def detect(path: Path) -> bool:
     """Whether a file begins as RTI files with hemispherical harmonics do."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(_MAGIC)) == _MAGIC
+    return begins(path, _MAGIC)
 
 
 def read(

@@ -9,7 +9,6 @@ Source: Matusik et al., "A Data-Driven Reflectance Model", 2003, and their BRDFR
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +17,10 @@ from numpy.typing import NDArray
 from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
-from btfkit.io import named
-from btfkit.textures import as_textures
+from btfkit.io import brdf, named
 
 BINS = (90, 90, 180)
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500
-# No surface has an f_r like that; a flipped bit has.
-MOST = 1e9
-TABLES = {"bonn81": directions.bonn81, "bonn151": directions.bonn151}
 
 
 def detect(path: Path) -> bool:
@@ -48,26 +43,9 @@ def read(path: Path, *, sampling: str | None = None) -> BTF:
         FormatError: other numbers of bins, or not the bytes they need.
     """
     values, record = named.assumptions(sampling=(sampling, "bonn81"))
-    if values["sampling"] not in TABLES:
-        raise ValueError(f"sampling {values['sampling']!r}; expected {' or '.join(TABLES)}")
-    table = TABLES[values["sampling"]]()
-    pairs = np.array(list(itertools.product(range(len(table)), repeat=2)))
-    light, view = table[pairs[:, 0]], table[pairs[:, 1]]
-    brdf = lookup(_planes(path), light, view)
-    quantity = np.pi * brdf * light[:, 2:]
-    return named.assembled(
-        path,
-        as_textures(quantity[:, None, None].astype(np.float32)),
-        light=light,
-        view=view,
-        wrap="wrap",
-        provenance={
-            "source": str(path),
-            "format": "merl",
-            "invalid_pairs": int(np.isnan(quantity).any(axis=1).sum()),
-            **record,
-        },
-    )
+    light, view = brdf.pairs_of(values["sampling"])
+    quantity = np.pi * lookup(_planes(path), light, view) * light[:, 2:]
+    return brdf.one_texel(path, quantity, light, view, name="merl", said=record)
 
 
 def lookup(
@@ -94,7 +72,7 @@ def lookup(
         np.clip(bins.astype(int), 0, size - 1) for bins, size in zip((i, j, k), BINS, strict=True)
     )
     found = np.moveaxis(planes[(slice(None), *index)], 0, -1) * SCALE
-    invalid = ~((found >= 0) & (found < MOST)).all(axis=-1)
+    invalid = ~((found >= 0) & (found < brdf.MOST)).all(axis=-1)
     found[invalid] = np.nan
     return found
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.io import relit
+from btfkit.io.magic import begins
 
 _MAGIC = b"PTM_1."
 _VERSION = "PTM_1.2"
@@ -35,10 +36,7 @@ _MOST_HEAD = 4096
 
 def detect(path: Path) -> bool:
     """Whether a file begins with PTM's first word."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(_MAGIC)) == _MAGIC
+    return begins(path, _MAGIC)
 
 
 def read(

@@ -16,7 +16,7 @@ from btfkit import colour, directions
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.io import lp, named
-from btfkit.io.merl import TABLES
+from btfkit.io.brdf import TABLES
 from btfkit.textures import Array, Textures
 
 # Texels a side that no camera gives: larger numbers are damage.

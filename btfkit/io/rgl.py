@@ -21,8 +21,8 @@ from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.io import named, tensorfile
-from btfkit.io.merl import MOST, TABLES
-from btfkit.textures import as_textures
+from btfkit.io.brdf import MOST, one_texel, pairs_of
+from btfkit.io.magic import begins
 
 Floats = NDArray[np.float64]
 _NEEDED = ("phi_i", "theta_i", "ndf", "sigma", "vndf", "jacobian")
@@ -33,10 +33,7 @@ _FEWEST_VALID = 0.5
 
 def detect(path: Path) -> bool:
     """Whether a file begins as tensor files do."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(tensorfile.MAGIC)) == tensorfile.MAGIC
+    return begins(path, tensorfile.MAGIC)
 
 
 def read(path: Path, *, sampling: str | None = None) -> BTF:
@@ -52,33 +49,15 @@ def read(path: Path, *, sampling: str | None = None) -> BTF:
     values, record = named.assumptions(
         sampling=(sampling, "bonn81"), incident=(None, "light: reflectance is reciprocal")
     )
-    if values["sampling"] not in TABLES:
-        raise ValueError(f"sampling {values['sampling']!r}; expected {' or '.join(TABLES)}")
-    table = TABLES[values["sampling"]]()
-    pairs = np.array(list(itertools.product(range(len(table)), repeat=2)))
-    light, view = table[pairs[:, 0]], table[pairs[:, 1]]
+    light, view = pairs_of(values["sampling"])
     measured = Measured.of(path, tensorfile.read(path))
     brdf = measured.brdf(light, view)
     usable: NDArray[np.bool_] = np.all((brdf >= 0) & (brdf < MOST), axis=1)
     if usable.mean() < _FEWEST_VALID:
         raise FormatError(path, f"{(~usable).mean():.0%} of the values are negative or not finite")
     quantity = np.where(usable[:, None], np.pi * brdf * light[:, 2:], np.nan)
-    return named.assembled(
-        path,
-        as_textures(quantity[:, None, None].astype(np.float32)),
-        light=light,
-        view=view,
-        wrap="wrap",
-        channels=measured.channels,
-        provenance={
-            "source": str(path),
-            "format": "rgl",
-            "isotropic": measured.isotropic,
-            "described": measured.described,
-            "invalid_pairs": int((~usable).sum()),
-            **record,
-        },
-    )
+    said = {"isotropic": measured.isotropic, "described": measured.described, **record}
+    return one_texel(path, quantity, light, view, name="rgl", said=said, channels=measured.channels)
 
 
 @final

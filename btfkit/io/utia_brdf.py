@@ -19,8 +19,7 @@ from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.io import named
-from btfkit.io.merl import MOST
-from btfkit.textures import as_textures
+from btfkit.io.brdf import MOST, one_texel
 
 _THETAS, _PHIS = 6, 48
 _BYTES = 3 * (_THETAS * _PHIS) ** 2 * 8
@@ -62,19 +61,7 @@ def read(path: Path, *, cosine: str | None = None, scale: float | None = None) -
     quantity = np.pi * float(values["scale"]) * brdf.reshape(-1, 3)
     if values["cosine"] == "out":
         quantity = quantity * light[:, 2:]
-    return named.assembled(
-        path,
-        as_textures(quantity[:, None, None].astype(np.float32)),
-        light=light,
-        view=view,
-        wrap="wrap",
-        provenance={
-            "source": str(path),
-            "format": "utia_brdf",
-            "invalid_pairs": int(np.isnan(quantity).any(axis=1).sum()),
-            **record,
-        },
-    )
+    return one_texel(path, quantity, light, view, name="utia_brdf", said=record)
 
 
 def _merged(brdf: NDArray[np.float64]) -> NDArray[np.float64]:

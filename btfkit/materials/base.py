@@ -55,7 +55,7 @@ class Header:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     steps: int = 0
     quantity: str = QUANTITY
-    coverage: Coverage | None = field(default=None, compare=False)
+    coverage: Coverage | None = None
 
     def __post_init__(self) -> None:
         if len(self.grid) != 2 or not all(isinstance(n, int) and n > 0 for n in self.grid):

@@ -125,15 +125,6 @@ def load(path: str | os.PathLike[str]) -> Material:
         raise FormatError(path, f"the header does not describe a material: {error}") from error
 
 
-def coverage_of(path: str | os.PathLike[str]) -> Coverage | None:
-    """Which lights and views the pairs behind a material had; None where the file has no word."""
-    arrays, _ = _read(path, want=lambda name: name.startswith(COVERAGE))
-    try:
-        return _coverage(arrays)
-    except (KeyError, ValueError) as error:
-        raise FormatError(path, f"what was measured is not readable: {error}") from error
-
-
 def _coverage(arrays: Mapping[str, NDArray[Any]]) -> Coverage | None:
     own = {n.removeprefix(COVERAGE): a for n, a in arrays.items() if n.startswith(COVERAGE)}
     return Coverage.of_arrays(own) if own else None

@@ -135,10 +135,16 @@ class Stack:
 
     def place(self, height: Array, rows: slice) -> Array:
         """(t, 3) points of the surface over the texels of some rows, as positions count."""
-        h, w = self.size
-        row, col = np.mgrid[rows, :w].reshape(2, -1).astype(np.float32)
-        x, y = col + 0.5 - w / 2, h / 2 - 0.5 - row
-        return np.stack([x, y, height[rows].reshape(-1)], axis=1).astype(np.float32)
+        return places(height, rows)
+
+
+def places(height: Array, rows: slice = slice(None)) -> Array:
+    """(t, 3) points over the texels of some rows of heights (h, w), texels from the centre."""
+    h, w = height.shape
+    grid = np.meshgrid(np.arange(h)[rows], np.arange(w), indexing="ij")
+    row, col = (part.reshape(-1).astype(np.float32) for part in grid)
+    x, y = col + 0.5 - w / 2, h / 2 - 0.5 - row
+    return np.stack([x, y, height[rows].reshape(-1)], axis=1).astype(np.float32)
 
 
 def read_stack(btf: BTF, *, progress: Progress | None = None) -> Stack:

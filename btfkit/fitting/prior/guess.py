@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.fitting.analytic import maps_of, slope_of
+from btfkit.fitting.lambert import sums
 from btfkit.fitting.prior.lobes import lobes_of
 from btfkit.native import trace as tracer
 from btfkit.relief.integration import integrate
-from btfkit.relief.stack import Stack, read_stack, sampled, spread
+from btfkit.relief.stack import Stack, places, read_stack, sampled, spread
 from btfkit.relief.trace import geometry
 
 Array = NDArray[np.float32]
@@ -118,7 +119,7 @@ def guessed(btf: BTF, pairs: NDArray[np.intp]) -> Guess:
     )
     lobes = lobes_of(
         values.reshape(-1, *values.shape[2:]), stack.light, stack.view, slopes=tells,
-        place=_places(low), near=(near[0], near[1]),
+        place=places(np.zeros(low, np.float32)), near=(near[0], near[1]),
     )  # fmt: skip
     t = low[0] * low[1]
     counts = np.isfinite(values).all(axis=3).sum(axis=2).reshape(-1).astype(np.float32)
@@ -190,13 +191,11 @@ def _tells_slopes(lights: Array) -> bool:
 
 def _lambert(stack: Stack) -> Array:
     """(h, w, c) albedo of least squared error; the mean where nothing is measured."""
-    h, w, n, c = stack.values.shape
-    product, square = np.zeros((h, w, c)), np.zeros((h, w, c))
-    for k in range(n):
-        image = stack.values[:, :, k].astype(np.float32)
-        measured, cosine = np.isfinite(image), float(max(stack.light[k, 2], 0))
-        product += np.where(measured, image, 0) * cosine
-        square += measured * cosine**2
+    images = (
+        (stack.values[:, :, k].astype(np.float32), max(float(z), 0.0))
+        for k, z in enumerate(stack.light[:, 2])
+    )
+    product, square = sums(images, (*stack.size, stack.values.shape[3]))
     if not square.any():
         raise ValueError("no texel of any pair is measured")
     mean = product.sum(axis=(0, 1)) / np.maximum(square.sum(axis=(0, 1)), 1e-12)
@@ -243,10 +242,3 @@ def enlarged(image: Array, size: tuple[int, int]) -> Array:
         return image
     found = cv2.resize(image, size[::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray(found, np.float32).reshape(*size, *image.shape[2:])
-
-
-def _places(size: tuple[int, int]) -> Array:
-    h, w = size
-    row, col = np.mgrid[:h, :w].reshape(2, -1)
-    x, y = col + 0.5 - w / 2, h / 2 - 0.5 - row
-    return np.stack([x, y, 0 * x], axis=1).astype(np.float32)
