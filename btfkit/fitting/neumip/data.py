@@ -283,3 +283,26 @@ def _cut(rows: Batch, at: slice) -> Batch:
 def _nothing(channels: int) -> Batch:
     arrays = [np.empty((0, size), np.float32) for size in (2, 3, 3, channels)]
     return Batch(arrays[0], arrays[1], arrays[2], None, arrays[3])
+
+
+def source_of(
+    data: BTF | QuerySet,
+    train: NDArray[np.intp],
+    test: NDArray[np.intp],
+    *,
+    levels: int,
+    curved: bool,
+    seed: int,
+    pool_bytes: int,
+    progress: Progress | None = None,
+) -> Source:
+    """Where batches of a BTF or of queries come from.
+
+    Args:
+        levels: of a BTF's textures that are drawn from. curved: whether a query's curvature counts.
+    """
+    if isinstance(data, BTF):
+        return TexelSource(
+            data, train, test, levels=levels, seed=seed, pool_bytes=pool_bytes, progress=progress
+        )
+    return RowSource(data, train, test, seed=seed, curved=curved)

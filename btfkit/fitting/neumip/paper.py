@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from btfkit.errors import FitError
+from btfkit.fitting.neumip.blurring import blur_at, blurred
 from btfkit.fitting.neumip.data import Batch
 from btfkit.fitting.neumip.forward import forward, loss_of, loss_on_batch, tensors
 from btfkit.fitting.neumip.recipe import Recipe
 from btfkit.fitting.neumip.settings import PaperSettings
 from btfkit.fitting.neumip.start import initial_texels
-from btfkit.footprint import gaussian
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.native.neural.adam import adam_plain
@@ -109,20 +109,15 @@ class NeuMIPPaper(Recipe[PaperSettings]):
         return square + 0.1 * linear
 
     def _blurred(self, texels: Tensor) -> Tensor:
-        """Textures blurred by 8 texels (of the finest) at first, halved nine times in a run."""
-        sigma = 8 * 2 ** (-9 * float(self._progress[0]))
-        if sigma < 0.1:
+        """Every level blurred alike, in tiles."""
+        sigma = blur_at(float(self._progress[0]))
+        if not sigma:
             return texels
-        parts = []
-        for levels in self.layout.textures(texels):
-            for s, texture in enumerate(levels):
-                h, w, _ = texture.shape
-                down, across = (
-                    torch.from_numpy(gaussian(side, (sigma / 2**s) ** 2, wrap=self.layout.wrap))
-                    for side in (h, w)
-                )
-                part = (down @ texture.reshape(h, -1)).reshape(h, w, -1)
-                parts.append((across @ part).reshape(h * w, -1))
+        parts = [
+            blurred(texture, sigma / 2**level, wrap=self.layout.wrap).flatten(0, 1)
+            for levels in self.layout.textures(texels)
+            for level, texture in enumerate(levels)
+        ]
         return torch.cat(parts)
 
     def _current(self) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from btfkit.btf import BTF, Wrap
 from btfkit.errors import FitError
 from btfkit.fitting.loop import Generators, Trainable
-from btfkit.fitting.neumip.data import Batch, RowSource, Source, TexelSource
+from btfkit.fitting.neumip.data import Batch, Source, TexelSource, source_of
 from btfkit.fitting.neumip.settings import Shared, refuse_unused
 from btfkit.fitting.prior.pairs import Guesses
 from btfkit.footprint import most_levels
@@ -76,17 +76,15 @@ class Recipe(Trainable, ABC, Generic[S]):
         progress: Any,
     ) -> Source:
         """What is drawn from, once the model's shapes are known."""
-        seed = self._generators.seed
-        if isinstance(source, BTF):
-            levels = self._data_levels()
-            textures = TexelSource(
-                source, train, test, levels=levels, seed=seed,
-                pool_bytes=self.settings.pool_mb << 20, progress=progress,
-            )  # fmt: skip
+        levels = self._data_levels()
+        found = source_of(
+            source, train, test, levels=levels, curved=self.spec.curved,
+            seed=self._generators.seed, pool_bytes=self.settings.pool_mb << 20, progress=progress,
+        )  # fmt: skip
+        if isinstance(source, BTF) and isinstance(found, TexelSource):
             self._guesses = self._guessed(source, train, levels)
-            textures.guess(self._guesses)
-            return textures
-        return RowSource(source, train, test, seed=seed, curved=self.spec.curved)
+            found.guess(self._guesses)
+        return found
 
     @property
     def begun(self) -> bool:

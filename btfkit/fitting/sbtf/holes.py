@@ -90,11 +90,3 @@ def thickness_of(
 def solid_at(opacity: Array, uv: Array, *, wrap: bool) -> NDArray[np.bool_]:
     """(b,) whether there is no hole at uv (b, 2)."""
     return np.asarray(bilinear(opacity[..., None], uv, wrap=wrap)[:, 0] >= 0.5)
-
-
-def resized(plane: NDArray[np.float32], size: tuple[int, int], *, wrap: bool) -> Array:
-    """(h, w) of another plane, read at the centres of its texels."""
-    h, w = size
-    u, v = np.meshgrid((np.arange(w) + 0.5) / w, (np.arange(h) + 0.5) / h)
-    at = np.stack([u, v], axis=-1).reshape(-1, 2)
-    return bilinear(plane[..., None], at, wrap=wrap).reshape(h, w).astype(np.float32)

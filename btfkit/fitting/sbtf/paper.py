@@ -20,13 +20,13 @@ from torch import Tensor
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.loop import Generators, Trainable
-from btfkit.fitting.neumip.data import Batch, RowSource, Source, TexelSource
+from btfkit.fitting.neumip.blurring import blur_at, blurred
+from btfkit.fitting.neumip.data import Batch, source_of
 from btfkit.fitting.neumip.forward import bilinear, directions
 from btfkit.fitting.neumip.recipe import header_of, texture_size
 from btfkit.fitting.neumip.settings import refuse_unused
 from btfkit.fitting.sbtf.labels import Labels, labels_of
 from btfkit.fitting.sbtf.settings import PaperSettings
-from btfkit.footprint import gaussian
 from btfkit.materials.sbtf import paper as evaluated
 from btfkit.materials.sbtf.paper import MODULES, SBTFPaperSpec
 from btfkit.native.neural.adam import adam_plain
@@ -37,8 +37,6 @@ from btfkit.settings import parsed
 
 # Share of the absolute loss beside the square one.
 _ABSOLUTE = 0.1
-# Texels by which textures are blurred at first, and how often that halves: as NeuMIP has it.
-_BLUR, _HALVES = 8.0, 9
 
 
 class _Known(NamedTuple):
@@ -82,14 +80,10 @@ class SBTFPaper(Trainable):
             channels=len(self._header.channels),
             precision=s.precision,  # type: ignore[arg-type]
         )
-        self._source: Source
-        if isinstance(source, BTF):
-            self._source = TexelSource(
-                source, train, test, levels=1, seed=generators.seed,
-                pool_bytes=s.pool_mb << 20, progress=progress,
-            )  # fmt: skip
-        else:
-            self._source = RowSource(source, train, test, seed=generators.seed, curved=True)
+        self._source = source_of(
+            source, train, test, levels=1, curved=True, seed=generators.seed,
+            pool_bytes=s.pool_mb << 20, progress=progress,
+        )  # fmt: skip
         self.masked = self._source.masked
         self._held = self._source.held_out()
         self._labels: Labels | None = None
@@ -202,19 +196,10 @@ class SBTFPaper(Trainable):
         return x
 
     def _blurred(self, leaves: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        sigma = _BLUR * 2 ** (-_HALVES * float(self._progress[0]))
+        sigma, wrap = blur_at(float(self._progress[0])), self._header.wrap == "wrap"
         found = dict(leaves)
-        if sigma < 0.1:
-            return found
-        h, w = self.spec.size
-        down, across = (
-            torch.from_numpy(gaussian(side, sigma**2, wrap=self._header.wrap == "wrap"))
-            for side in (h, w)
-        )
-        for module in MODULES:
-            texture = leaves[f"texture.{module}"]
-            part = (down @ texture.reshape(h, -1)).reshape(h, w, -1)
-            found[f"texture.{module}"] = across @ part
+        for name in (f"texture.{module}" for module in MODULES if sigma):
+            found[name] = blurred(leaves[name], sigma, wrap=wrap)
         return found
 
     def material(self) -> evaluated.SBTFPaper:

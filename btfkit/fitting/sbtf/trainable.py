@@ -21,6 +21,7 @@ from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.materials.sbtf import material as sbtf
 from btfkit.native.neural.layout import Array
+from btfkit.native.neural.lookup import resized
 from btfkit.program import Heights
 from btfkit.queries import QuerySet
 from btfkit.relief.relief import Relief
@@ -90,9 +91,10 @@ class SBTF(Marching[Settings]):
             return
         wrap = relief.wrap == "wrap"
         height = relief.under_surface()[0].height / np.float32(self.spec.depth_scale)
-        self._given = holes.resized(height, self.spec.size, wrap=wrap)
+        self._given = resized(height, self.spec.size, wrap=wrap).astype(np.float32)
         if self.spec.holes and relief.opacity is not None:
-            self._opacity = holes.resized(relief.opacity, self.spec.size, wrap=wrap)
+            opacity = resized(relief.opacity, self.spec.size, wrap=wrap)
+            self._opacity = opacity.astype(np.float32)
             self._thickness = self.settings.thickness / self.spec.depth_scale
             self._thickness = self._thickness or -float(self._given.min())
         self._keep_given()

@@ -28,7 +28,7 @@ from btfkit.materials import PROGRAMS
 from btfkit.materials.base import Header, Material
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.spec import NeuMIPSpec
-from btfkit.native.neural.lookup import bilinear
+from btfkit.native.neural.lookup import resized
 from btfkit.program import Heights, Program
 from btfkit.queries import QuerySet
 
@@ -198,7 +198,4 @@ def _resized(heights: NDArray[Any], size: tuple[int, ...], *, wrap: bool) -> NDA
         gaussian(old, blur_of(max(0.5 * ratio, 0.5)), wrap=wrap)
         for old, ratio in zip(heights.shape, ratios, strict=True)
     )
-    soft = down @ heights @ across.T
-    v, u = np.meshgrid(*((np.arange(n) + 0.5) / n for n in size), indexing="ij")
-    at = np.stack([u, v], axis=-1).reshape(-1, 2)
-    return bilinear(soft[..., None], at, wrap=wrap).reshape(size)
+    return resized(down @ heights @ across.T, size, wrap=wrap)

@@ -29,3 +29,11 @@ def bilinear(texture: Array, uv: Array, *, wrap: bool) -> Array:
     upper = texture[y0, x0] * (1 - fx) + texture[y0, x1] * fx
     lower = texture[y1, x0] * (1 - fx) + texture[y1, x1] * fx
     return upper * (1 - fy) + lower * fy
+
+
+def resized(plane: Array, size: tuple[int, ...], *, wrap: bool) -> Array:
+    """(h, w) of another plane, read at the centres of the texels of `size`."""
+    h, w = size
+    u, v = np.meshgrid((np.arange(w) + 0.5) / w, (np.arange(h) + 0.5) / h)
+    at = np.stack([u, v], axis=-1).reshape(-1, 2)
+    return bilinear(plane[..., None], at, wrap=wrap).reshape(h, w)
