@@ -56,12 +56,15 @@ def steps(trainable, first, last, of=40):
 @pytest.mark.parametrize("settings", SETTINGS)
 def test_on_a_device_a_fit_takes_the_steps_of_the_kernels(settings):
     ours, theirs = fresh(**settings).on_device("cpu"), fresh(**settings)
-    losses = steps(ours, 0, 20), steps(theirs, 0, 20)
-    # float32 in another order, through 20 steps of Adam: 1e-6 was seen. Offsets begin at 0, and
-    # their network with gradients that are next to rounding, which Adam makes as large as others.
-    bound = 2e-2 if settings.get("depth") == "network" else 1e-3
-    np.testing.assert_allclose(*losses, rtol=1e-4)
-    assert apart(ours.state(), theirs.state()) < bound
+    losses, distances = [], []
+    for k in range(20):
+        losses.append((*steps(ours, k, k + 1), *steps(theirs, k, k + 1)))
+        distances.append(apart(ours.state(), theirs.state()))
+        ours.restore(theirs.state())
+    # float32 in another order; in some step a ray that grazes its relief may end elsewhere.
+    np.testing.assert_allclose(*np.array(losses).T, rtol=1e-6)
+    assert np.median(distances) < 1e-5, distances
+    assert max(distances) < 5e-3, distances
     assert ours.score() == pytest.approx(theirs.score(), rel=1e-4)
     assert ours.queries == theirs.queries > 0
 
