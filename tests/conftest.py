@@ -26,3 +26,13 @@ def real_data() -> Path:
     if not folder:
         pytest.skip("BTFKIT_REAL_DATA names no folder of real measurements")
     return Path(folder)
+
+
+@pytest.fixture(autouse=True)
+def guessed_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few: nearly every fit in a test is one of few pairs, and making all guesses takes seconds.
+
+    How good they are is measured where this fixture is replaced.
+    """
+    monkeypatch.setattr("btfkit.fitting.prior.pairs._PAIRS", 64)
+    monkeypatch.setattr("btfkit.fitting.prior.pairs._COARSE_PAIRS", 16)

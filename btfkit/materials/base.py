@@ -60,10 +60,19 @@ class Header:
     def __post_init__(self) -> None:
         if len(self.grid) != 2 or not all(isinstance(n, int) and n > 0 for n in self.grid):
             raise ValueError(f"grid = {self.grid}; expected (h, w), both positive")
-        if not self.channels or not all(isinstance(name, str) for name in self.channels):
+        names = self.channels if isinstance(self.channels, tuple) else ()
+        if not names or not all(isinstance(name, str) for name in names):
             raise ValueError(f"channels = {self.channels}; expected one name a channel")
         if self.wrap not in ("wrap", "clamp"):
             raise ValueError(f"wrap = {self.wrap!r}; expected 'wrap' or 'clamp'")
+        if not isinstance(self.provenance, Mapping):
+            raise ValueError(f"provenance = {self.provenance!r}; expected names and values")
+        if not isinstance(self.licence, str | None) or not isinstance(self.quantity, str):
+            raise ValueError(
+                f"licence = {self.licence!r}, quantity = {self.quantity!r}; expected text"
+            )
+        if self.texel_mm is not None and not 0 < self.texel_mm < math.inf:
+            raise ValueError(f"texel_mm = {self.texel_mm}; expected a length")
 
     @staticmethod
     def of(btf: BTF) -> Header:
@@ -123,6 +132,9 @@ class Material(ABC):
                 if found.get(name) != expected.get(name)
             )
             raise ValueError(f"weights do not fit the spec of {self.model}: {'; '.join(wrong)}")
+        answered = getattr(spec, "channels", len(header.channels))
+        if answered != len(header.channels):
+            raise ValueError(f"{answered} channels of answers for channels = {header.channels}")
         self.spec = spec
         self.weights = dict(weights)
         self.header = header

@@ -24,6 +24,11 @@ from btfkit.relief.trace import traced_btf
 SIZE = 32
 
 
+@pytest.fixture(autouse=True)
+def guessed_pairs() -> None:
+    """As many as users have."""
+
+
 def in_memory(btf: BTF) -> BTF:
     return replace(btf, textures=btf.textures.batch(range(len(btf))))
 

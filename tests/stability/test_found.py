@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import struct
 import time
@@ -12,11 +13,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
 
 from btfkit.cli import btfkit as command
 from btfkit.cli.outcome import run
 from btfkit.errors import FormatError, one_line
 from btfkit.io import archive, detect, images, queryfile
+from btfkit.materials import file as model_file
+from btfkit.materials.base import Header
+from btfkit.materials.lambert import Lambert, LambertSpec
 
 
 def _npy(header: str, body: bytes = b"") -> bytes:
@@ -110,3 +116,24 @@ def test_a_name_cannot_speak_to_the_terminal(
     assert "\x1b" not in said.out + said.err
     assert "\\x1b[2Jwool" in said.out
     assert io.StringIO(said.err).read().startswith("next: ")
+
+
+@pytest.mark.parametrize("name", ["spec", "provenance", "channels"])
+@pytest.mark.parametrize(
+    "told", ["[" * 9999, "__import__('os')", "null", "3", '["a"]', '{"size": 1}']
+)
+def test_a_header_that_describes_no_material_is_refused_in_one_line(
+    name: str, told: str, tmp_path: Path
+) -> None:
+    texture = np.ones((4, 4, 3), np.float32)
+    path = tmp_path / "m.safetensors"
+    model_file.save(Lambert(LambertSpec((4, 4)), {"texture": texture}, Header((4, 4))), path)
+    arrays = load_file(path)
+    with safe_open(path, "numpy") as file:
+        metadata = file.metadata()
+    save_file(arrays, path, metadata | {name: told})
+    for read in (model_file.load, model_file.header_of):
+        with contextlib.suppress(FormatError):
+            read(path)
+    with pytest.raises(FormatError, match="the header does not describe a material"):
+        model_file.load(path)
