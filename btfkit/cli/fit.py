@@ -106,10 +106,12 @@ def fit_verb(
     Writes the model and OUT.report.json beside it. Ctrl-C keeps the best state so far.
     With --cluster, several: a task a material; one that fails is named at the end.
     `--model student --from MODEL` fits a small model to a large one's answers.
+    Under torchrun several processes fit one material (neumip, sbtf).
     """
     from btfkit.errors import unknown
     from btfkit.fitting import MODELS
     from btfkit.fitting.fit import fit
+    from btfkit.fitting.training import following
     from btfkit.sources import material, measured
 
     if model != "auto" and model not in MODELS:
@@ -148,8 +150,9 @@ def fit_verb(
     report = fit(
         None if path is None else measured(path),
         teacher=taught,
-        out=out or default,
-        resume=resume,
+        # Of processes that fit together only the first one writes.
+        out=None if following() else out or default,
+        resume=resume and not following(),
         progress=bar,
         phase=bar.phase,
         force=force,

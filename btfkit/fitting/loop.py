@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, final
+from typing import TYPE_CHECKING, Any, ClassVar, final
 
 import numpy as np
 import torch
@@ -24,6 +24,9 @@ from btfkit.errors import FitError, FormatError
 from btfkit.files import whole
 from btfkit.materials.base import Material
 from btfkit.relief.relief import Relief
+
+if TYPE_CHECKING:
+    from btfkit.fitting.processes import Processes
 
 # Held-out looks at the model: enough for a curve, and a small share of the time. Where time is
 # what is shared, they become rarer, so that they take no more than this of it.
@@ -96,6 +99,21 @@ class Trainable(ABC):
         """The same model trained on a torch device, or None where it knows the CPU alone."""
         del device
         return None
+
+    def join(self, processes: Processes) -> None:
+        """Take every step together with other processes.
+
+        In the first one this returns at once, in the others when the first has `part`ed.
+
+        Raises:
+            FitError: the model is trained by one process alone.
+        """
+        del processes
+        raise FitError(f"{self.model} is fitted by one process", remedy="start it without torchrun")
+
+    def part(self) -> bool:
+        """Let the others go; whether there were any."""
+        return False
 
     def slow_down(self) -> None:
         """Halve the learning rates, after a divergence."""

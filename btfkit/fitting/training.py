@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -70,6 +72,8 @@ def solved(
     """A closed form, which reads its data as it goes."""
     if plan.resume:
         raise FitError(f"nothing to resume: {model} is solved at once", remedy="leave out --resume")
+    if shared():
+        raise FitError(f"{model} is fitted by one process", remedy="start it without torchrun")
     if plan.out is not None and model == "interpolation":
         room_for(plan.out, 2 * _values(source), what="an interpolation of these data")
     start, cpu = time.perf_counter(), time.process_time()
@@ -146,7 +150,8 @@ def trained(
     if plan.device == "cuda" and not gpu():
         raise FitError("no CUDA device is available", remedy="use --device cpu")
     torch.set_num_threads(native.threads())
-    generators = loop.Generators(plan.seed)
+    # Processes that fit together draw other queries, of other textures where not all have room.
+    generators = loop.Generators(plan.seed + int(os.environ["RANK"] if shared() else 0))
     if isinstance(source, QuerySet):
         phases.begin("starting")
     train, test = split(len(source), plan.holdout, plan.seed)
@@ -159,6 +164,13 @@ def trained(
     where = "cpu"
     if plan.device != "cpu" and gpu() and (moved := trainable.on_device(gpu())):
         trainable, where = moved, gpu()
+    if shared():
+        from btfkit.fitting.processes import Processes
+
+        trainable.join(Processes(where))
+        if following():
+            # It has taken its last step with the first.
+            sys.exit(0)
     run = loop.Run(None, plan.steps)
     state, best = None if plan.out is None else state_file(plan.out), None
     if state is not None:
@@ -170,9 +182,12 @@ def trained(
     phases.begin("training")
     if plan.steps is None:
         run.budget_s = phases.training_s()
-    loop.train(
-        trainable, run, generators=generators, state_file=state, progress=progress, best=best
-    )
+    try:
+        loop.train(
+            trainable, run, generators=generators, state_file=state, progress=progress, best=best
+        )
+    finally:
+        trainable.part()
     if run.interrupted and state is not None and run.done == 0:
         raise KeyboardInterrupt
     ran = Ran(
@@ -181,6 +196,16 @@ def trained(
         trainable.stated(),
     )  # fmt: skip
     return trainable.material(), ran
+
+
+def shared(environment: Mapping[str, str] = os.environ) -> bool:
+    """Whether torchrun started this process beside others."""
+    return environment.get("WORLD_SIZE", "1") not in ("", "1") and "RANK" in environment
+
+
+def following(environment: Mapping[str, str] = os.environ) -> bool:
+    """Whether it started another one first, which decides what is done."""
+    return shared(environment) and environment["RANK"] != "0"
 
 
 def gpu() -> str:

@@ -23,6 +23,7 @@ from btfkit.fitting.neumip.recipe import Recipe
 from btfkit.fitting.neumip.settings import INPUTS, Settings, Stepped
 from btfkit.fitting.neumip.start import begin_from, initial_texels, initial_weights
 from btfkit.fitting.prior.pairs import Guesses, guesses
+from btfkit.fitting.processes import Processes
 from btfkit.fitting.schedule import pace
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.arrays import aligned
@@ -65,6 +66,22 @@ class Marching(Recipe[S]):
         kind = Compiled if available() else Plain
         loss: Loss = self.settings.loss  # type: ignore[assignment]
         self.engine: Engine[Any] = kind(layout, arrays, self._source, loss)
+
+    def join(self, processes: Processes) -> None:
+        from btfkit.fitting.neumip.engines.together import Together, follow
+
+        if processes.rank:
+            follow(self.engine, processes)
+        else:
+            self.engine = Together(self.engine, processes)
+
+    def part(self) -> bool:
+        from btfkit.fitting.neumip.engines.together import Together
+
+        together = isinstance(self.engine, Together)
+        if isinstance(self.engine, Together):
+            self.engine = self.engine.ended()
+        return together
 
     def _current(self) -> tuple[Array, Array]:
         return self.engine.parameters()

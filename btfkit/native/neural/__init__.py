@@ -147,6 +147,10 @@ class Kernel:
         self._model.gradients(weights, texels)
         return weights, texels
 
+    def replace(self, weights: Array, texels: Array) -> None:
+        """Let the gradients kept here be others: (weights,) and (texels, 8)."""
+        self._model.replace(weights, texels)
+
     def adam(
         self,
         weights: tuple[Array, Array, Array],

@@ -267,6 +267,22 @@ class Model {
         }
     }
 
+    // Replaces the gradients kept here by others.
+    void replace(In<float> w, In<float> t) {
+        require(int64_t(w.size()) == weights() && int64_t(t.size()) == texels() * kChannels,
+                "sizes of the gradients");
+        grow(1);
+        for (size_t i = 0; i < weights_.size(); ++i) {
+            std::fill(weights_[i].begin(), weights_[i].end(), 0.f);
+            std::fill_n(texels_[i].data(), t.size(), 0.f);
+            std::fill(touched_[i].begin(), touched_[i].end(), uint8_t(0));
+        }
+        std::copy(w.data(), w.data() + w.size(), weights_[0].begin());
+        std::copy(t.data(), t.data() + t.size(), texels_[0].data());
+        for (size_t k = 0; k < t.size(); ++k)
+            touched_[0][k / (2 * kChannels)] |= t.data()[k] != 0;
+    }
+
     // One step of Adam with the gradients kept here, which are zeroed.
     void adam(Out<float> w, Out<float> wm, Out<float> wv, Out<float> t, Out<float> tm,
               Out<float> tv, float lr_weights, float lr_texels, float b1, float b2, float eps,
@@ -388,6 +404,7 @@ NB_MODULE(_neural, m) {
              nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg().none(), nb::arg(),
              nb::arg(), nb::arg())
         .def("gradients", &Model::gradients)
+        .def("replace", &Model::replace)
         .def("adam", &Model::adam);
     m.def("blur", &neumip::blur);
     m.def("variants", [] {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sized
+from collections.abc import Mapping, Sequence, Sized
 from dataclasses import dataclass
 from typing import Generic, TypeVar, final
 
@@ -80,9 +80,18 @@ class Engine(ABC, Generic[B]):
     def batch(self, number: int, count: int) -> B:
         """The `count` queries with answers of step `number`, where the engine reads them."""
 
-    @abstractmethod
     def take(self, batch: B, step: Step) -> float:
         """One step; its loss, or NaN where parameters are no numbers any more."""
+        loss, *gradients = self.pull(batch)
+        return self.push(loss, gradients, step)
+
+    @abstractmethod
+    def pull(self, batch: B) -> tuple[Tensor, Tensor, Tensor]:
+        """Loss of a batch, its gradients by weights and by texels, where the parameters are."""
+
+    @abstractmethod
+    def push(self, loss: Tensor, gradients: Sequence[Tensor], step: Step) -> float:
+        """The step that gradients of weights and texels lead to; returns as `take`."""
 
     @abstractmethod
     def parameters(self) -> tuple[Array, Array]:

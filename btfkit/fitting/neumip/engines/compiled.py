@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import final
 
 import numpy as np
@@ -73,7 +73,20 @@ class Compiled(Engine[Batch]):
         return self._source.batch(number, count)
 
     def take(self, batch: Batch, step: Step) -> float:
-        loss = self._gradients(batch)
+        # The kernel keeps its gradients.
+        return self._moved(self._gradients(batch), step)
+
+    def pull(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+        loss = torch.tensor(self._gradients(batch), dtype=torch.float64)
+        weights, texels = map(torch.from_numpy, self._kernel.gradients())
+        return loss, weights, texels
+
+    def push(self, loss: Tensor, gradients: Sequence[Tensor], step: Step) -> float:
+        weights, texels = gradients
+        self._kernel.replace(weights.numpy(), texels.numpy())
+        return self._moved(float(loss), step)
+
+    def _moved(self, loss: float, step: Step) -> float:
         weights, texels = (self._arrays.slots(name) for name in PARAMETERS)
         self._kernel.adam(
             weights, texels, lr=step.rates, step=step.number, betas=step.betas, dense=step.dense
@@ -115,14 +128,17 @@ class Plain(Engine[Batch]):
     def batch(self, number: int, count: int) -> Batch:
         return self._source.batch(number, count)
 
-    def take(self, batch: Batch, step: Step) -> float:
+    def pull(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         weights, texels = (torch.from_numpy(a).requires_grad_() for a in self.parameters())
         loss = loss_on_batch(self._layout, weights, texels, batch, self._loss)
-        gradients = torch.autograd.grad(loss, (weights, texels))
+        by_weights, by_texels = torch.autograd.grad(loss, (weights, texels))
+        return loss.detach(), by_weights, by_texels
+
+    def push(self, loss: Tensor, gradients: Sequence[Tensor], step: Step) -> float:
         for name, rate, gradient in zip(PARAMETERS, step.rates, gradients, strict=True):
             slots = self._arrays.slots(name)
             adam_plain(slots, gradient.numpy(), rate, step.number, step.betas, dense=step.dense)
-        return float(loss.detach()) if self._arrays.settle(step) else math.nan
+        return float(loss) if self._arrays.settle(step) else math.nan
 
     def parameters(self) -> tuple[Array, Array]:
         return self._arrays.parameters()

@@ -7,7 +7,7 @@ knows the layout. A state goes from here to the CPU's kernels and back.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import final
 
 import numpy as np
@@ -107,12 +107,15 @@ class OnDevice(Engine[DeviceBatch]):
     def batch(self, number: int, count: int) -> DeviceBatch:
         return self._source.batch(number, count)
 
-    def take(self, batch: DeviceBatch, step: Step) -> float:
+    def pull(self, batch: DeviceBatch) -> tuple[Tensor, Tensor, Tensor]:
         tensors = self._tensors
-        loss, *gradients = self._gradients.gradients(
+        return self._gradients.gradients(
             tensors["weights"], tensors["texels"], batch.queries, batch.target, batch.weight,
             loss=self._loss,
         )  # fmt: skip
+
+    def push(self, loss: Tensor, gradients: Sequence[Tensor], step: Step) -> float:
+        tensors = self._tensors
         for name, rate, gradient in zip(PARAMETERS, step.rates, gradients, strict=True):
             first, second = (tensors[f"{name}.{moment}"] for moment in MOMENTS)
             slots = (tensors[name], first, second)

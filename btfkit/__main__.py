@@ -1,0 +1,5 @@
+"""`python -m btfkit`: the command, for programs that start Python modules."""
+
+from btfkit.cli import main
+
+main()
