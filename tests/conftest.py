@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 # Before anything counts processors: parallel workers that each took them all would wait for
@@ -28,11 +29,22 @@ def real_data() -> Path:
     return Path(folder)
 
 
-@pytest.fixture(autouse=True)
-def guessed_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few: nearly every fit in a test is one of few pairs, and making all guesses takes seconds.
+@pytest.fixture(scope="session", autouse=True)
+def few_guesses() -> Iterator[None]:
+    """Nearly every fit in a test is one of few pairs, and making all guesses takes seconds.
 
-    How good they are is measured where this fixture is replaced.
+    How good they are is measured where `all_guesses` is.
     """
-    monkeypatch.setattr("btfkit.fitting.prior.pairs._PAIRS", 64)
-    monkeypatch.setattr("btfkit.fitting.prior.pairs._COARSE_PAIRS", 16)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("btfkit.fitting.prior.pairs._PAIRS", 64)
+        patch.setattr("btfkit.fitting.prior.pairs._COARSE_PAIRS", 16)
+        yield
+
+
+@pytest.fixture(scope="module")
+def all_guesses() -> Iterator[None]:
+    """As many as users have."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("btfkit.fitting.prior.pairs._PAIRS", 1536)
+        patch.setattr("btfkit.fitting.prior.pairs._COARSE_PAIRS", 128)
+        yield

@@ -382,7 +382,8 @@ def test_equal_seed_and_steps_give_equal_bytes_and_resuming_changes_nothing():
 def test_without_the_kernel_torch_takes_the_same_steps(monkeypatch):
     def losses():
         model = trainable.NeuMIP(bumps(), np.arange(60), np.arange(0),
-                                 generators=loop.Generators(0), settings={"batch": "256"})  # fmt: skip
+                                 generators=loop.Generators(0),
+                                 settings={"batch": "256", "guessed": "0"})  # fmt: skip
         return [model.step(k / 20) for k in range(20)], model.state()
 
     fast, first = losses()

@@ -24,9 +24,7 @@ from btfkit.relief.trace import traced_btf
 SIZE = 32
 
 
-@pytest.fixture(autouse=True)
-def guessed_pairs() -> None:
-    """As many as users have."""
+pytestmark = pytest.mark.usefixtures("all_guesses")
 
 
 def in_memory(btf: BTF) -> BTF:
