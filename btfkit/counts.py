@@ -158,6 +158,8 @@ def _check_layout(name: str, data: bytes) -> None:
         FormatError: a TIFF or PNG that is not one picture of grey or RGB counts as they are.
     """
     if data.startswith(b"\x89PNG"):
+        if len(data) < 26:
+            raise FormatError(name, "the image is cut short", remedy="copy it again")
         bits, kind = data[24], data[25]
         if kind not in (0, 2) or bits not in (8, 16):
             what = _PNG_KINDS.get(kind, f"colour type {kind}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, final
@@ -109,8 +110,8 @@ def grid_of(
 ) -> Grid:
     """Texels over the sample's area."""
     size = sequence.target.get("sample", {}).get("size_mm")
-    good = isinstance(size, list) and len(size) == 2 and all(s > 0 for s in size)
-    if not good or not isinstance(size, list):
+    numbers = isinstance(size, list) and all(isinstance(s, int | float) for s in size)
+    if not numbers or len(size) != 2 or not all(0 < s < math.inf for s in size):
         raise CalibrationError(
             f"sequence.json says no target.sample.size_mm (found {size!r})",
             remedy="give width and height of the sample's area in mm",

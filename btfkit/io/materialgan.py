@@ -131,11 +131,15 @@ def _positions(holder: Archive, name: str, n: int) -> Array:
     return np.broadcast_to(rows, (n, 3)).astype(np.float32)
 
 
+# Radiance x cm^2 beyond which, or below its inverse, no lamp is: such numbers are damage.
+_FAINTEST = 1e-15
+
+
 def _power(holder: Archive, name: str) -> Array | None:
     if name not in holder:
         return None
     power = holder.table(name, 3)
-    if len(power) != 1 or (power <= 0).any():
+    if len(power) != 1 or not ((power > _FAINTEST) & (power < 1 / _FAINTEST)).all():
         raise FormatError(
             holder.path / name, f"holds {power.ravel().tolist()}; expected three powers above 0"
         )

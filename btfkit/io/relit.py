@@ -46,7 +46,25 @@ class Relighting(ABC):
         """
         every = slice(0, self.size[0]), slice(0, self.size[1])
         unit = directions.checked("light", light, upper=True).astype(np.float64)
-        return np.stack([_decoded(transfer, self.codes(d, *every)) for d in unit])
+        return np.stack([self.linear(transfer, d, *every) for d in unit])
+
+    def linear(
+        self, transfer: str, light: NDArray[np.float64], rows: slice, cols: slice
+    ) -> NDArray[np.float32]:
+        """(h, w, 3) linear values of `codes`.
+
+        Raises:
+            FormatError: the coefficients lead beyond what a float32 holds.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = _decoded(transfer, self.codes(light, rows, cols))
+        if not np.isfinite(found).all():
+            raise FormatError(
+                self.path,
+                "its coefficients give values that are no numbers",
+                remedy="copy it again",
+            )
+        return found
 
 
 def _decoded(transfer: str, codes: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -129,7 +147,7 @@ class _Textures(Textures):
 
     def _read(self, index: int) -> Array:
         relighting, light = self._relighting, self._light[index]
-        linear = _decoded(self._transfer, relighting.codes(light, *self._at))
+        linear = relighting.linear(self._transfer, light, *self._at)
         factor = 1.0 if self._cosine == "in" else max(light[2], 0.0)
         return np.asarray(linear * np.float32(factor), np.float32)
 

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import struct
 import time
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import sources
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
+import btfkit
 from btfkit.cli import btfkit as command
 from btfkit.cli.outcome import run
-from btfkit.errors import FormatError, one_line
+from btfkit.errors import BtfkitError, FormatError, one_line
 from btfkit.io import archive, detect, images, queryfile
 from btfkit.materials import file as model_file
 from btfkit.materials.base import Header
@@ -120,7 +124,7 @@ def test_a_name_cannot_speak_to_the_terminal(
 
 @pytest.mark.parametrize("name", ["spec", "provenance", "channels"])
 @pytest.mark.parametrize(
-    "told", ["[" * 9999, "__import__('os')", "null", "3", '["a"]', '{"size": 1}']
+    "told", ["[" * 9999, "__import__('os')", "null", "3", '["a"]', '"a"']
 )
 def test_a_header_that_describes_no_material_is_refused_in_one_line(
     name: str, told: str, tmp_path: Path
@@ -137,3 +141,52 @@ def test_a_header_that_describes_no_material_is_refused_in_one_line(
             read(path)
     with pytest.raises(FormatError, match="the header does not describe a material"):
         model_file.load(path)
+
+
+def _lamp(folder: Path) -> None:
+    (folder / "light_power.txt").write_text("1e-320,1500.0,1400.0\n")
+
+
+def _coefficients(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    # Scales of the coefficients, behind the header's lines.
+    start = data.index(b"\n", data.rindex(b"\n", 0, 60)) + 1
+    data[start : start + 32] = np.full(8, 3e38, "<f4").tobytes()
+    path.write_bytes(data)
+
+
+def _area(folder: Path) -> None:
+    path = folder / "sequence.json"
+    told = json.loads(path.read_text())
+    told["target"]["sample"]["size_mm"] = [7, [[5]]]
+    path.write_text(json.dumps(told))
+
+
+def _shard(folder: Path) -> None:
+    path = folder / "texture" / "zarr.json"
+    told = json.loads(path.read_text())
+    told["chunk_grid"]["configuration"]["chunk_shape"][1] *= 2
+    path.write_text(json.dumps(told))
+
+
+def _frame(folder: Path) -> None:
+    (folder / "frames" / "000.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(4) + b"IEND\xaeB`\x82")
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("materialgan", _lamp, "expected three powers above 0"),
+        ("hsh", _coefficients, "its coefficients give values that are no numbers"),
+        ("sequence", _area, "says no target.sample.size_mm"),
+        ("zarr", _shard, "chunk|checksum|texture 0"),
+        ("sequence", _frame, "cut short"),
+    ],
+)
+def test_what_lies_in_a_source_is_refused_by_name(
+    name: str, change: Callable[[Path], None], message: str, tmp_path: Path
+) -> None:
+    source = sources.SOURCES[name](tmp_path)
+    change(source)
+    with pytest.raises(BtfkitError, match=message):
+        btfkit.open(source).texture(0)

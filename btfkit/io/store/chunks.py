@@ -37,7 +37,7 @@ class Chunks:
     def __init__(self, array: zarr.Array[Any], shard_path: Any) -> None:
         self._shape, self._dtype = array.shape[1:], np.dtype(array.dtype).newbyteorder("<")
         self._bytes = int(np.prod(self._shape)) * self._dtype.itemsize
-        self._run = (array.shards or array.chunks)[0]
+        self._run = array.shards[0] if array.shards else 1
         self._path = shard_path
         self._indices: dict[int, NDArray[np.uint64]] = {}
 
@@ -72,7 +72,10 @@ class Chunks:
 
 
 def are_ours(array: zarr.Array[Any]) -> bool:
-    """Whether an array is packed as `Chunks` reads it: Blosc and CRC32C in shards, index last."""
+    """Whether an array is packed as `Chunks` reads it.
+
+    Whole textures, Blosc and CRC32C, in shards with the index last.
+    """
     codecs = array.metadata.to_dict().get("codecs")
     if not isinstance(codecs, (list, tuple)) or len(codecs) != 1:
         return False
@@ -81,8 +84,12 @@ def are_ours(array: zarr.Array[Any]) -> bool:
     inner = [(c["name"], c.get("configuration", {}).get("endian")) for c in settings["codecs"]] \
         if outer.get("name") == "sharding_indexed" else []  # fmt: skip
     index = [codec["name"] for codec in settings.get("index_codecs", ())]
+    whole = array.shape[1:]
     return (
-        inner == [("bytes", "little"), ("blosc", None), ("crc32c", None)]
+        array.chunks == (1, *whole)
+        and array.shards is not None
+        and array.shards[1:] == whole
+        and inner == [("bytes", "little"), ("blosc", None), ("crc32c", None)]
         and index == ["bytes", "crc32c"]
         and settings.get("index_location") == "end"
     )
