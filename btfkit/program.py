@@ -240,7 +240,33 @@ class Program:
             return "network"
         if any(head.kind == "opacity" for head in self.heads):
             return "head"
-        return "march" if isinstance(self.depth, Heights) and self.depth.curved else "none"
+        return "march" if self.curved else "none"
+
+    @property
+    def networks(self) -> tuple[Cover | DepthNetwork | OffsetNetwork, ...]:
+        """Networks with a texture of their own, in the order in which they are asked."""
+        kinds = (Cover, DepthNetwork, OffsetNetwork)
+        return tuple(part for part in (self.cover, self.depth) if isinstance(part, kinds))
+
+    @property
+    def every_layer(self) -> tuple[Dense, ...]:
+        """The layers, and those of all networks."""
+        return (*self.layers, *(layer for part in self.networks for layer in part.layers))
+
+    @property
+    def every_input(self) -> frozenset[str]:
+        """Names of what any first layer takes."""
+        return frozenset((*self.inputs, *(name for part in self.networks for name in part.inputs)))
+
+    @property
+    def curved(self) -> bool:
+        """Whether curvature bends rays on their way through heights."""
+        return isinstance(self.depth, Heights) and self.depth.curved
+
+    @property
+    def bends(self) -> bool:
+        """Whether answers depend on curvature."""
+        return self.curved or "curvature" in self.every_input
 
     def described(self) -> dict[str, Any]:
         """The program in JSON types, arrays by their shapes."""

@@ -225,13 +225,11 @@ def _to_go_on(report: FitReport) -> Outcome:
 
 def _next(report: FitReport) -> str:
     """What one does with a fitted model."""
-    from btfkit.export.arrays import refuse_unknown
-
     out = shlex.quote(report.out or "")
     if report.material.model in ("neubtf", "neubtf-paper") and not report.untrained:
         return f"btfkit propagate guidance.png --model {out}"
     try:
-        refuse_unknown(report.material.program(), "glsl")
+        report.material.program()
     except TypeError:
         return f"btfkit render {out} --shape sphere"
     return f"btfkit view {out}"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.program import DepthNetwork, Heights, OffsetNetwork, Program, Texture
+from btfkit.program import Heights, Program, Texture
 
 Array = NDArray[Any]
 
@@ -36,13 +36,8 @@ def textures(program: Program) -> Iterator[Texture]:
     yield from program.textures
     if program.scaling:
         yield program.scaling
-    if isinstance(program.depth, DepthNetwork):
-        yield program.depth.texture
+    yield from (part.texture for part in program.networks)
     yield from holes(program)
-
-
-# Targets that follow rays which curvature bends.
-BENT = ("npz", "exr", "cpp", "glsl")
 
 
 def holes(program: Program) -> list[Texture]:
@@ -51,30 +46,6 @@ def holes(program: Program) -> list[Texture]:
     if not isinstance(found, Heights) or found.opacity is None:
         return []
     return [Texture("opacity", (found.opacity[..., None],))]
-
-
-def refuse_unknown(program: Program, target: str = "") -> None:
-    """TypeError for what an exporter does not know how to write."""
-    if program.cover is not None or isinstance(program.depth, OffsetNetwork):
-        raise TypeError(
-            "this material has networks of opacity and offset of its own, which no export has; "
-            "expected one whose rays end at heights or by a network of depth"
-        )
-    if isinstance(program.depth, Heights) and program.depth.curved and target not in BENT:
-        raise TypeError(
-            f"the view ray of this material bends with curvature, which {target or 'a page'} does "
-            f"not follow; {', '.join(BENT)} do"
-        )
-
-
-def refuse_bent(program: Program, target: str) -> None:
-    """TypeError for rays that bend and for networks of opacity and offset, in `target`."""
-    bent = isinstance(program.depth, Heights) and program.depth.curved
-    if bent or program.cover is not None or isinstance(program.depth, OffsetNetwork):
-        raise TypeError(
-            f"{target} has no form here for rays that bend with curvature, nor for networks of "
-            "opacity and offset; expected a material whose rays end on the plane's own heights"
-        )
 
 
 def _named(value: Any, name: str, arrays: dict[str, Array]) -> Any:

@@ -30,7 +30,15 @@ from btfkit.export.sections import filled, sections, whole_text
 from btfkit.materials.base import Material
 from btfkit.native.neural import bent
 from btfkit.native.neural.plain import YUV_TO_RGB
-from btfkit.program import Dense, DepthNetwork, Heights, Program, Texture
+from btfkit.program import (
+    Cover,
+    Dense,
+    DepthNetwork,
+    Heights,
+    OffsetNetwork,
+    Program,
+    Texture,
+)
 
 SPACE = "btfkit_material"
 # Inputs of `conventions.INPUTS` by the names of the header's variables.
@@ -66,7 +74,7 @@ def write(material: Material, program: Program, folder: Path) -> None:
 def source(program: Program, *, model: str, texel_mm: float | None = None) -> tuple[str, bytes]:
     """The header's text and the bytes of its numbers."""
     store = _Store()
-    body = [*_depth(program, store), *_features(program, store), *_answer(program, store)]
+    body = [*_networks(program, store), *_features(program, store), *_answer(program, store)]
     constants = store.constants(program)
     h, w = program.grid
     edge = texel_mm or 0.0
@@ -167,9 +175,15 @@ def _scale(program: Program) -> float:
 
 def _curvature(program: Program) -> dict[str, object]:
     """What a header says of curvature: nothing where rays are straight."""
-    found = program.depth
-    if not (isinstance(found, Heights) and found.curved):
+    if not program.bends:
         return {**dict.fromkeys(("more", "given", "bad", "tenth"), ""), "columns": 9}
+    found = program.depth
+    said = {
+        "more": ", curvature", "given": ", float curvature = 0",
+        "bad": " || !std::isfinite(curvature)", "tenth": ", row[9]", "columns": 10,
+    }  # fmt: skip
+    if not isinstance(found, Heights):
+        return said
     low, high = bent.sharpest(found)
     most = "std::numeric_limits<float>::infinity()"
     reach = _number(bent.hole_range(found))
@@ -179,8 +193,7 @@ def _curvature(program: Program) -> dict[str, object]:
         f"    return std::max(z - height, (0.5f - solid) * {reach});\n  }}\n"
     )
     return {
-        "more": ", curvature", "given": ", float curvature = 0",
-        "bad": " || !std::isfinite(curvature)", "tenth": ", row[9]", "columns": 10,
+        **said,
         "flattest": _number(low) if np.isfinite(low) else f"-{most}",
         "sharpest": _number(high) if np.isfinite(high) else most,
         "seen": _number(LOWEST_SEEN), "bend": _number(MOST_BEND), "finer": _number(CURVED_FINER),
@@ -195,43 +208,53 @@ def _number(value: Any) -> str:
 
 def _chosen(program: Program) -> tuple[list[str], list[str]]:
     """Sections before the generated lines, and after them, that the program needs."""
-    inputs = {*program.inputs}
-    depth = program.depth
-    if isinstance(depth, DepthNetwork):
-        inputs |= {*depth.inputs}
-    layers = [*program.layers, *(depth.layers if isinstance(depth, DepthNetwork) else ())]
-    kinds = {head.kind for head in program.heads}
+    inputs, depth, layers = program.every_input, program.depth, program.every_layer
+    covered = program.cover is not None and program.cover.kind == "direct"
+    sigmoid = covered or any(head.kind in ("mask", "opacity") for head in program.heads)
     half = program.frames > 0 or inputs & {"hx", "hy", "hz", "cos_diff"}
     disc = any(name.endswith("_disc") for name in inputs)
     marched = isinstance(depth, Heights)
     before = ["level" if program.leveled else "no_level"]
-    curved = isinstance(depth, Heights) and depth.curved
+    curved, steps = program.curved, isinstance(depth, (Heights, DepthNetwork))
     before += ["bent_depth"] * curved + ["half"] * bool(half) + ["disc"] * disc
     if not curved:
-        before += ["march_depth"] * marched + ["steps"] * (depth is not None)
+        before += ["march_depth"] * marched + ["steps"] * steps
     after = ["beside_wrap" if program.wrap else "beside_clamp", "pyramid"]
     after += ["dense"] * bool(layers) + ["normal"] * any(x.gain is not None for x in layers)
-    after += ["rounded"] * program.rounded + ["sigmoid"] * bool(kinds & {"mask", "opacity"})
-    after += ["on_disc"] * disc + ["step"] * (depth is not None) + ["crossing"] * marched
+    after += ["rounded"] * program.rounded + ["sigmoid"] * sigmoid
+    after += ["on_disc"] * disc + ["step"] * steps + ["crossing"] * marched
     after += ["bent"] * curved
     return before, after
 
 
-def _depth(program: Program, store: _Store) -> list[str]:
-    found = program.depth
-    if isinstance(found, Heights):
-        store.levels("kHeights", (found.heights,))
-        if found.opacity is not None:
-            store.levels("kOpacity", (found.opacity,))
-    if not isinstance(found, DepthNetwork):
-        return []
-    place = store.levels("kDepth", (found.texture.levels[0],))
-    k = found.texture.levels[0].shape[-1]
-    names = {name: f"psi[{i}]" for i, name in enumerate(found.texture.features)}
-    lines = [f"float psi[{k}] = {{}};", f"lookup<{k}>({place}[0], uv[0], uv[1], 1, psi);"]
-    lines += _gathered("d0", found.inputs, {**_INPUTS, **names})
-    lines += _layers("d", found.layers, store, rounded=program.rounded)
-    return [*lines, f"const float depth = d{len(found.layers)}[0] * {_number(found.scale)};"]
+def _networks(program: Program, store: _Store) -> list[str]:
+    """Opacity, and depth or offset, where networks of their own say them."""
+    heights = program.depth
+    if isinstance(heights, Heights):
+        store.levels("kHeights", (heights.heights,))
+        if heights.opacity is not None:
+            store.levels("kOpacity", (heights.opacity,))
+    found: list[str] = []
+    for part in program.networks:
+        name, place = ("c", "kCover") if isinstance(part, Cover) else ("d", "kDepth")
+        store.levels(place, (part.texture.levels[0],))
+        k, psi = part.texture.levels[0].shape[-1], f"{name}_psi"
+        known = _INPUTS | {feature: f"{psi}[{i}]" for i, feature in enumerate(part.texture.features)}
+        found += [f"float {psi}[{k}] = {{}};", f"lookup<{k}>({place}[0], uv[0], uv[1], 1, {psi});"]
+        found += _gathered(f"{name}0", part.inputs, known)
+        found += _layers(name, part.layers, store, rounded=program.rounded)
+        last = f"{name}{len(part.layers)}"
+        if isinstance(part, DepthNetwork):
+            found.append(f"const float depth = {last}[0] * {_number(part.scale)};")
+        elif isinstance(part, OffsetNetwork):
+            found.append(f"const float* offset = {last};")
+        else:
+            seen = f"view[2] >= {last}[0] ? 1.0f : 0.0f"
+            found.append(
+                f"out.opacity = {seen if part.kind == 'cosine' else f'sigmoid({last}[0])'};"
+            )
+            found.append("if (!(out.opacity > 0)) return out;")
+    return found
 
 
 def _features(program: Program, store: _Store) -> list[str]:
@@ -251,6 +274,8 @@ def _moved(program: Program, texture: Texture) -> tuple[str, str]:
     if program.depth is None or not (texture.view or texture.light):
         return "uv[0]", "uv[1]"
     view, light = _number(texture.view), _number(texture.light)
+    if isinstance(program.depth, OffsetNetwork):
+        return f"uv[0] + {view} * offset[0]", f"uv[1] + {view} * offset[1]"
     return tuple(  # type: ignore[return-value]
         f"uv[{k}] + depth * ({view} * toward[{k}] - {light} * away[{k}])" for k in range(2)
     )
@@ -281,6 +306,8 @@ def _output(program: Program, last: str, heads: dict[str, int]) -> list[str]:
     loop, most = "for (int c = 0; c < kChannels; ++c)", _number(MOST_LOG)
     if program.output == "cosine":
         return [f"{loop} out.rgb[c] = {last}[{heads['linear']} + c] * light[2];"]
+    if program.output == "linear":
+        return [f"{loop} out.rgb[c] = std::max({last}[{heads['linear']} + c], 0.0f);"]
     masked = f"(0.1f + sigmoid({last}[{heads['mask']} + c]))" if "mask" in heads else ""
     if program.output == "released":
         rows = ", ".join("{" + ", ".join(map(_number, row)) + "}" for row in YUV_TO_RGB)

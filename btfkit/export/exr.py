@@ -18,10 +18,18 @@ from btfkit.export.arrays import narrowed
 from btfkit.export.npz import reader
 from btfkit.io.images.encoding import write_exr
 from btfkit.materials.base import Material
-from btfkit.program import Dense, DepthNetwork, Heights, Program, Texture
+from btfkit.program import (
+    Cover,
+    Dense,
+    DepthNetwork,
+    Heights,
+    OffsetNetwork,
+    Program,
+    Texture,
+)
 
 VERSION = 1
-_LEFT = ("textures", "layers", "scaling", "depth", "heads")
+_LEFT = ("textures", "layers", "scaling", "depth", "cover", "heads")
 
 
 def write(material: Material, program: Program, folder: Path) -> None:
@@ -35,8 +43,11 @@ def write(material: Material, program: Program, folder: Path) -> None:
     ]
     if program.scaling:
         found["scaling"] = _texture(program.scaling, "scaling", folder)
-    if isinstance(program.depth, (Heights, DepthNetwork)):
+    if program.depth is not None:
         found["depth"] = _depth(program.depth, folder)
+    if program.cover is not None:
+        kind = program.cover.kind
+        found["cover"] = {"kind": kind, **_network(program.cover, "cover", folder)}
     found["layers"] = [layer_described(layer) for layer in program.layers]
     (folder / "model.json").write_text(json.dumps(found, indent=1) + "\n")
     (folder / "evaluate.py").write_text(reader(program, material.model, arrays="exr"))
@@ -58,7 +69,7 @@ def layer_described(layer: Dense) -> dict[str, Any]:
     return found
 
 
-def _depth(depth: Heights | DepthNetwork, folder: Path) -> dict[str, Any]:
+def _depth(depth: Heights | DepthNetwork | OffsetNetwork, folder: Path) -> dict[str, Any]:
     if isinstance(depth, Heights):
         (name,) = _mips("heights", (depth.heights[..., None],), folder)
         found: dict[str, Any] = {"heights": name, "scale": depth.scale, "curved": depth.curved}
@@ -67,11 +78,20 @@ def _depth(depth: Heights | DepthNetwork, folder: Path) -> dict[str, Any]:
         if depth.opacity is not None:
             (found["opacity"],) = _mips("opacity", (depth.opacity[..., None],), folder)
         return found
+    found = _network(depth, "offset", folder)
+    if isinstance(depth, DepthNetwork):
+        found["scale"] = depth.scale
+    return found
+
+
+def _network(
+    part: DepthNetwork | OffsetNetwork | Cover, name: str, folder: Path
+) -> dict[str, Any]:
+    """A network with a texture of its own, which becomes the files of this name."""
     return {
-        "texture": _texture(depth.texture, "offset", folder),
-        "inputs": list(depth.inputs),
-        "layers": [layer_described(layer) for layer in depth.layers],
-        "scale": depth.scale,
+        "texture": _texture(part.texture, name, folder),
+        "inputs": list(part.inputs),
+        "layers": [layer_described(layer) for layer in part.layers],
     }
 
 

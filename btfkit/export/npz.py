@@ -26,7 +26,7 @@ from btfkit.export.sections import filled, sections
 from btfkit.materials.base import Material
 from btfkit.native.neural import bent
 from btfkit.native.neural.plain import YUV_TO_RGB
-from btfkit.program import Heights, Program
+from btfkit.program import DepthNetwork, Heights, OffsetNetwork, Program
 
 
 def write(material: Material, program: Program, folder: Path) -> None:
@@ -45,22 +45,28 @@ def reader(program: Program, model: str, *, arrays: str = "npz") -> str:
     """
     parts = sections("numpy.py.txt")
     wanted = ["start", f"arrays_{arrays}", "activations", "lookup", "run"]
-    curved = isinstance(program.depth, Heights) and program.depth.curved
-    if isinstance(program.depth, Heights):
+    curved, depth, cover = program.curved, program.depth, program.cover
+    wanted += ["network"] * bool(program.networks)
+    if isinstance(depth, Heights):
         wanted += ["march"] + ["march_bent"] * curved
     wanted += ["known"] + ["bent_depth"] * curved + ["half"]
-    if any(name.endswith("_disc") for name in program.inputs):
+    if any(name.endswith("_disc") for name in program.every_input):
         wanted.append("disc")
-    if program.depth is not None and not curved:
-        wanted.append("march_depth" if isinstance(program.depth, Heights) else "network_depth")
+    if cover is not None:
+        wanted.append(f"network_cover_{cover.kind}")
+    if isinstance(depth, Heights) and not curved:
+        wanted.append("march_depth")
+    if isinstance(depth, DepthNetwork):
+        wanted.append("network_depth")
     moved = "textures_bent" if curved else "textures_moved"
-    wanted += [moved if program.depth is not None else "textures"]
+    moved = "textures_offset" if isinstance(depth, OffsetNetwork) else moved
+    wanted += [moved if depth is not None else "textures"]
     wanted += ["frames"] * bool(program.frames) + ["layers"]
     wanted += ["scaling"] * (program.scaling is not None)
     wanted += [f"output_{program.output}"]
     if program.output in ("log", "relu"):
         wanted += ["mask"] * any(head.kind == "mask" for head in program.heads) + ["expm1"]
-    last = {"head": "opacity", "march": "passed"}.get(program.opacity, "opaque")
+    last = {"head": "opacity", "march": "passed", "network": "covered"}.get(program.opacity, "opaque")
     wanted += [last, "end"]
     return filled(
         "".join(parts[name] for name in wanted),
@@ -73,17 +79,22 @@ def reader(program: Program, model: str, *, arrays: str = "npz") -> str:
 
 def _curvature(program: Program) -> dict[str, object]:
     """What a reader says of curvature: nothing where rays are straight."""
-    if not (isinstance(program.depth, Heights) and program.depth.curved):
+    if not program.bends:
         names = ("more", "given", "flat", "safe", "filed")
         return {**dict.fromkeys(names, ""), "told": "0 * level"}
-    low, high = bent.sharpest(program.depth)
-    return {
+    said = {
         "more": ", curvature",
         "given": ", curvature=None",
         "flat": "    curvature = np.zeros(len(uv)) if curvature is None else curvature\n",
         "safe": ", (curvature, 0)",
         "filed": ', Q["curvature"] if "curvature" in Q else None',
         "told": f"curvature / ({CURVATURE_UNIT} + np.abs(curvature))",
+    }
+    if not isinstance(program.depth, Heights):
+        return said
+    low, high = bent.sharpest(program.depth)
+    return {
+        **said,
         "flattest": f"{low!r}" if np.isfinite(low) else "-np.inf",
         "sharpest": f"{high!r}" if np.isfinite(high) else "np.inf",
         "slack": SLACK,

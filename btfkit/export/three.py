@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from btfkit.export.arrays import refuse_bent
 from btfkit.export.glsl import drawable, rgb
 from btfkit.export.sections import filled, sections
 from btfkit.materials.base import Material
@@ -19,7 +18,6 @@ THREE = "0.187.0"
 
 def write(material: Material, program: Program, folder: Path) -> None:
     """`material.json`, `material.bin`, `btfkit.js`, `index.html`, `package.json`, `check.mjs`."""
-    refuse_bent(program, "three")
     made = drawable(program, model=material.model)
     h, w = program.grid
     parts: dict[str, Any] = {}

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from btfkit.btf import BTF
-from btfkit.export.arrays import refuse_unknown
 from btfkit.export.glsl import drawable, encoded, rgb
 from btfkit.export.package import about
 from btfkit.export.sections import filled, whole_text
 from btfkit.materials.base import Material
-from btfkit.program import Heights
 from btfkit.view import slices
 from btfkit.view.page import composed, in_script, section
 
@@ -29,13 +27,11 @@ def page(
         ValueError: textures that a browser cannot hold.
     """
     program = material.program()
-    refuse_unknown(program, "glsl")
     made = drawable(program, model=material.model, texels="byte" if small else "half")
     c = len(program.channels)
-    bent = isinstance(program.depth, Heights) and program.depth.curved
     scene = filled(
         section("scene.glsl.txt", "scene"),
-        channels=c, rgb=rgb(program.channels), curvature="curvature, " if bent else "",
+        channels=c, rgb=rgb(program.channels), curvature="curvature, " if program.bends else "",
     )  # fmt: skip
     h, w = program.grid
     carried = {

@@ -15,6 +15,7 @@ from btfkit.materials.neumip.material import NeuMIP, NeuMIPPaper
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.materials.rainer import Rainer20, RainerSpec
 from btfkit.materials.sbtf.material import SBTF
+from btfkit.materials.sbtf.paper import SBTFPaper, SBTFPaperSpec
 
 GRID = (24, 36)
 NEUMIP = NeuMIPSpec(
@@ -33,7 +34,7 @@ SPECS = {
     "neubtf-paper": (NeuBTFPaper, NeuBTFSpec((16, 24), omega=1.25, parallax=True), "wrap"),
     "rainer20": (Rainer20, RainerSpec((8, 12), latents=32, whitened=True), "clamp"),
 }
-# Those whose rays curvature bends, which only some exports follow.
+# Those that answer curvature: rays through heights bend, or networks hear of it.
 BENT = {
     "sbtf": (
         SBTF,
@@ -43,6 +44,12 @@ BENT = {
     "sbtf with holes": (
         SBTF,
         NeuMIPSpec(GRID, levels=1, heights=True, curved=True, holes=True, looks=24),
+        "clamp",
+    ),
+    "sbtf-paper": (SBTFPaper, SBTFPaperSpec((10, 14), hidden=(16, 16)), "wrap"),
+    "sbtf-paper direct": (
+        SBTFPaper,
+        SBTFPaperSpec((10, 14), hidden=(12, 12), opacity="direct", offset_curvature=False),
         "clamp",
     ),
 }
@@ -65,9 +72,12 @@ def made(name: str, *, seed: int = 0) -> Material:
             value = rng.uniform(0.1, 0.3, shape)
         else:
             value = rng.normal(0, 1 / np.sqrt(shape[-1]), shape) + 0.1 * part.endswith("bias")
-        if part == "renderer.out.bias":
+        if part in ("renderer.out.bias", "colour.2.bias"):
             # Else most answers would be cut to 0.
             value += 1
+        if part == "opacity.2.bias":
+            # So that some rays pass, and some do not.
+            value += 2.8 if spec.opacity == "cosine" else 0.75
         if name == "bright" and part == "decoder.3.bias":
             value += 9
         half = part.startswith("texture") and getattr(spec, "precision", "") == "float16"

@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 from cases import BENT, directions, made
 
-from btfkit.export import TARGETS
-from btfkit.export.arrays import BENT as FOLLOW
 from btfkit.export.glsl import drawable, encoded
 from btfkit.export.glsl.atlas import quantised
-from btfkit.export.package import ASKED, export
+from btfkit.export.package import export
 from btfkit.export.sections import whole_text
 from btfkit.materials.base import Material
+from btfkit.materials.sbtf.paper import SBTFPaper
 from btfkit.native.neural import plain
 from btfkit.queries import Response
 
@@ -53,18 +52,29 @@ def wanted(material: Material, queries: Asked) -> Response:
 
 def settled(material: Material, queries: Asked) -> np.ndarray:
     """Rows whose rays end at one place, however their numbers are rounded."""
+    uv, view, bend = reduced(material, queries)
+    if isinstance(material, SBTFPaper):
+        if material.spec.opacity == "direct":
+            return np.ones(len(uv), bool)
+        program = material.program()
+        assert program.cover is not None
+        edge = plain._looked_up(program, program.cover, uv, view, bend)[:, 0]
+        return np.abs(view[:, 2] - edge) > 1e-5
     ends = []
-    reduced = queries["uv"] - np.floor(queries["uv"])
-    uv = reduced if material.header.wrap == "wrap" else queries["uv"].clip(0, 1)
-    low, high = material.sharpest  # type: ignore[attr-defined]
     for kind in (np.float32, np.float64):
         program = material.program().in_dtype(kind)
-        view = queries["view"].astype(kind)
-        view /= np.linalg.norm(view, axis=1, keepdims=True)
-        bend = np.nan_to_num(queries["curvature"]).clip(low, high).astype(kind)
-        ends.append(plain.marched(program, uv.astype(kind), view, bend))
+        ends.append(plain.marched(program, uv.astype(kind), view.astype(kind), bend.astype(kind)))
     (one, first, _), (other, second, _) = ends
     return (np.abs(one - other) < 1e-6) & (first == second)
+
+
+def reduced(material: Material, queries: Asked) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """uv in one tile, views of length 1, and the curvature that is answered."""
+    uv = queries["uv"] - np.floor(queries["uv"])
+    uv = uv if material.header.wrap == "wrap" else queries["uv"].clip(0, 1)
+    view = queries["view"] / np.linalg.norm(queries["view"], axis=1, keepdims=True)
+    low, high = getattr(material, "sharpest", (-1e30, 1e30))
+    return uv, view, np.nan_to_num(queries["curvature"]).clip(low, high).astype(np.float32)
 
 
 def agree(rgb: np.ndarray, opacity: np.ndarray, response: Response, rows: np.ndarray) -> None:
@@ -76,7 +86,7 @@ def agree(rgb: np.ndarray, opacity: np.ndarray, response: Response, rows: np.nda
     assert (np.abs(rgb - response.reflectance) <= limit)[rows].all()
     masked = slice(420, 423), slice(430, 440)
     assert not any(opacity[part].any() or rgb[part].any() for part in masked)
-    assert 0.02 < (opacity[rows] == 0).mean() < 0.7
+    assert 0.02 < (opacity[rows] < 0.5).mean() < 0.7
     assert (rgb[:400] > 0).any()
 
 
@@ -108,10 +118,10 @@ def test_the_header_follows_bent_rays(name: str, tmp_path: Path) -> None:
     agree(answers[:, :-1], answers[:, -1], wanted(material, queries), rows)
 
 
-@pytest.mark.parametrize("target", sorted(set(TARGETS) - {*ASKED, *FOLLOW}))
-def test_the_others_name_those_that_do(target: str, tmp_path: Path) -> None:
-    with pytest.raises(TypeError, match=rf"which {target} does not follow; npz, exr, cpp, glsl do"):
-        export(made("sbtf"), target, tmp_path / "out")
+@pytest.mark.parametrize("name", ["sbtf with holes", "sbtf-paper"])
+def test_a_scene_of_blender_has_no_form_for_them(name: str, tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="which OSL is not written for"):
+        export(made(name), "blender", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -147,16 +157,14 @@ def test_the_shader_follows_bent_rays(tmp_path: Path) -> None:
         found = np.frombuffer(base64.b64decode(text), "<f4").reshape(n, 4)
         material = made(name)
         near = quantised(material.program(), "half")
-        uv = queries["uv"] - np.floor(queries["uv"]) if near.wrap else queries["uv"].clip(0, 1)
-        low, high = material.sharpest  # type: ignore[attr-defined]
-        bend = queries["curvature"].clip(low, high).astype(np.float32)
+        uv, view, bend = reduced(material, queries)
         rgb, opacity = plain.answer(
-            near, uv, queries["light"], queries["view"], queries["footprint"], bend
+            near, uv, queries["light"], view, queries["footprint"], bend
         )
         rows = settled(material, queries)
-        same = found[:, 3] == opacity
+        same = np.abs(found[:, 3] - opacity) < 1e-5
         assert same[rows].mean() > 0.995
         off = np.abs(found[:, :3] - rgb) / np.maximum(1, np.abs(rgb))
         # Polynomials of 1e-7 and divisions of 2.5 units: a place of 1e-6 tiles, random texels.
         assert np.mean(off[rows & same].max(axis=1) < 2e-3) > 0.99
-        assert 0.02 < (opacity == 0).mean() < 0.7
+        assert 0.02 < (opacity < 0.5).mean() < 0.7

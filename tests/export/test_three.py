@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import browser
+import cv2
 import numpy as np
 import pytest
 from cases import made
@@ -135,11 +136,27 @@ def rays() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.browser
-def test_the_page_draws_and_says_nothing_in_the_console(modules: Path, tmp_path: Path) -> None:
+def test_the_page_shows_a_ball_and_says_nothing_in_the_console(
+    modules: Path, tmp_path: Path
+) -> None:
+    # A picture of the page resizes its window, so that this is what it shows after that, too.
+    picture = tmp_path / "seen.png"
     with served(exported("neumip", modules, tmp_path / "out")) as address:
-        seen = browser.load(f"{address}/", "--virtual-time-budget=2000")
+        seen = browser.screenshot(f"{address}/", picture, (400, 300), "--virtual-time-budget=4000")
     assert seen.errors == []
-    assert "<canvas" in seen.dom
+    drawn = cv2.imread(str(picture)).astype(int)
+    assert drawn.shape == (300, 400, 3)
+    ground = (np.abs(drawn - 0x33) <= 1).all(axis=-1)
+    # Of a camera of 35 degrees at 4, a ball of 1 fills 0.82 of the height, round at any width.
+    radius = 150 / np.tan(np.radians(17.5)) / np.sqrt(4**2 - 1)
+    y, x = np.mgrid[:300, :400]
+    off = np.hypot(x + 0.5 - 200, y + 0.5 - 150) - radius
+    assert not ground[off < -2].any()
+    # Below the line of text.
+    assert ground[(off > 2) & (y > 30)].all()
+    # The light comes from the upper right: textured there, and dark opposite of it.
+    assert drawn[60:150, 200:290].std() > 5
+    assert drawn[245:250, 132:137].max() == 0
 
 
 @pytest.mark.browser

@@ -119,8 +119,10 @@ def quantised(program: Program, texels: Texels) -> Program:
             depth = replace(depth, opacity=found["opacity"][0][..., 0])
     elif depth is not None:
         depth = replace(depth, texture=exchanged(depth.texture))
+    cover = program.cover and replace(program.cover, texture=exchanged(program.cover.texture))
     return replace(
         program,
+        cover=cover,
         textures=tuple(exchanged(texture) for texture in program.textures),
         scaling=program.scaling and exchanged(program.scaling),
         depth=depth,

@@ -21,7 +21,7 @@ from btfkit.conventions import (
     SLACK,
     STEEPEST,
 )
-from btfkit.export.arrays import holes
+from btfkit.export.arrays import textures
 from btfkit.export.glsl import layers
 from btfkit.export.glsl.atlas import Atlas
 from btfkit.export.glsl.layers import Source, Weights, vec4
@@ -29,7 +29,7 @@ from btfkit.export.numbers import literal
 from btfkit.export.sections import filled, sections
 from btfkit.native.neural import bent
 from btfkit.native.neural.plain import YUV_TO_RGB
-from btfkit.program import DepthNetwork, Heights, Program, Texture
+from btfkit.program import Cover, DepthNetwork, Heights, OffsetNetwork, Program, Texture
 
 # Vectors of a query, four numbers each, under the names that `conventions.INPUTS` has.
 VECTORS = (
@@ -58,18 +58,16 @@ class Shader:
 
 def shader(program: Program, atlas: Atlas, *, model: str) -> Shader:
     """The function `btfkit_evaluate` of a program whose textures lie in an atlas."""
-    depth = program.depth
-    every = [*program.layers, *(depth.layers if isinstance(depth, DepthNetwork) else ())]
-    wide = Weights() if layers.size(every) > layers.MOST_LITERALS else None
-    body = [*_depth(program, wide), *_features(program), *_answer(program, wide)]
+    wide = Weights() if layers.size(program.every_layer) > layers.MOST_LITERALS else None
+    body = [*_networks(program, wide), *_features(program), *_answer(program, wide)]
     parts = sections("material.glsl.txt")
     first, last = _chosen(program, wide=wide is not None)
     values = _values(program, model)
     head = filled("".join(parts[name] for name in first), **values)
-    looks = "".join(_look(texture, atlas) for texture in _looked(program))
+    looks = "".join(_look(texture, atlas) for texture in textures(program))
     function = filled("".join(parts[name] for name in last), **values)
     text = head + looks + function + "".join(f"  {line}\n" for line in body) + "}\n"
-    if curved(program):
+    if program.bends:
         text += filled(parts["on_the_plane"], **values)
     return Shader(text, None if wide is None else _texture(wide.rows))
 
@@ -80,26 +78,18 @@ def _texture(rows: list[NDArray[Any]]) -> NDArray[np.float32]:
     return found.reshape(-1, 1024, 4)
 
 
-def _looked(program: Program) -> list[Texture]:
-    depth = [program.depth.texture] if isinstance(program.depth, DepthNetwork) else []
-    return [*depth, *program.textures, *([program.scaling] if program.scaling else []),
-            *holes(program)]  # fmt: skip
-
-
 def _chosen(program: Program, *, wide: bool) -> tuple[list[str], list[str]]:
-    depth, inputs = program.depth, {*program.inputs}
-    if isinstance(depth, DepthNetwork):
-        inputs |= {*depth.inputs}
+    depth, inputs = program.depth, program.every_input
     marched, disc = isinstance(depth, Heights), any(n.endswith("_disc") for n in inputs)
-    kinds = {head.kind for head in program.heads}
-    every = [*program.layers, *(depth.layers if isinstance(depth, DepthNetwork) else ())]
+    covered = program.cover is not None and program.cover.kind == "direct"
+    sigmoid = covered or any(head.kind in ("mask", "opacity") for head in program.heads)
     first = ["start"] + ["heights_uniform"] * marched + ["weights_uniform"] * wide
     first += ["beside_wrap" if program.wrap else "beside_clamp", "lookup"] + ["march"] * marched
-    first += ["rounded"] * program.rounded + ["sigmoid"] * bool(kinds & {"mask", "opacity"})
-    first += ["sine"] * any(layer.activation == "sine" for layer in every)
-    first += ["disc"] * disc + ["step"] * (depth is not None)
+    first += ["rounded"] * program.rounded + ["sigmoid"] * sigmoid
+    first += ["sine"] * any(layer.activation == "sine" for layer in program.every_layer)
+    first += ["disc"] * disc + ["step"] * isinstance(depth, (Heights, DepthNetwork))
     half = program.frames > 0 or inputs & {"hx", "hy", "hz", "cos_diff"}
-    bent_ = curved(program)
+    bent_ = program.curved
     last = ["bent"] * bent_ + ["evaluate", "level" if program.leveled else "no_level"]
     last += ["bent_depth"] * bent_ + ["half"] * bool(half)
     return first, last + ["march_depth"] * (marched and not bent_)
@@ -123,16 +113,11 @@ def _values(program: Program, model: str) -> dict[str, object]:
     return found
 
 
-def curved(program: Program) -> bool:
-    """Whether curvature bends rays."""
-    return isinstance(program.depth, Heights) and program.depth.curved
-
-
 def _curvature(program: Program) -> dict[str, object]:
     """What a shader says of curvature: nothing where rays are straight."""
-    found = program.depth
+    found, more = program.depth, "float curvature, " * program.bends
     if not (isinstance(found, Heights) and found.curved):
-        return {"more": ""}
+        return {"more": more}
     near = replace(found, heights=found.heights.astype(np.float16).astype(np.float32))
     top, bottom = max(float(near.heights.max()), 0.0), min(float(near.heights.min()), 0.0)
     low, high = bent.sharpest(near)
@@ -142,7 +127,7 @@ def _curvature(program: Program) -> dict[str, object]:
         f"  gap = max(gap - {literal(SLACK * bent.hole_range(near))}, (0.5 - solid.x) * {reach});\n"
     )
     return {
-        "more": "float curvature, ",
+        "more": more,
         "hole": hole if found.opacity is not None else "",
         "holes": "true" if found.opacity is not None else "false",
         "least_bend": literal(-MOST_BEND / max(top, 1e-6)),
@@ -235,30 +220,44 @@ def _vectors(inputs: Iterable[str], prefix: str) -> tuple[list[str], list[Source
     return lines, found
 
 
-def _depth(program: Program, wide: Weights | None) -> list[str]:
-    found = program.depth
-    if not isinstance(found, DepthNetwork):
-        return []
-    lines, sources = _vectors(found.inputs, "dq")
-    some, scalars = layers.lines(
-        "d", found.layers, found.inputs, [*sources_of(found.texture), *sources],
-        rounded=program.rounded, wide=wide,
-    )  # fmt: skip
-    looked = _called(found.texture, "uv", "0.0")
-    return [*looked, *lines, *some, f"float depth = {scalars[0]} * {literal(found.scale)};"]
+def _networks(program: Program, wide: Weights | None) -> list[str]:
+    """Opacity, and depth or offset, where networks of their own say them."""
+    found: list[str] = []
+    for name, part in zip("cd", (program.cover, program.depth), strict=True):
+        if not isinstance(part, (Cover, DepthNetwork, OffsetNetwork)):
+            continue
+        lines, sources = _vectors(part.inputs, f"{name}q")
+        some, scalars = layers.lines(
+            name, part.layers, part.inputs, [*sources_of(part.texture), *sources],
+            rounded=program.rounded, wide=wide,
+        )  # fmt: skip
+        found += [*_called(part.texture, "uv", "0.0"), *lines, *some]
+        if isinstance(part, DepthNetwork):
+            found.append(f"float depth = {scalars[0]} * {literal(part.scale)};")
+        elif isinstance(part, OffsetNetwork):
+            found.append(f"vec2 offset = vec2({scalars[0]}, {scalars[1]});")
+        else:
+            seen = f"view.z >= {scalars[0]} ? 1.0 : 0.0"
+            direct = f"btfkit_sigmoid({scalars[0]})"
+            found.append(f"opacity = {direct if part.kind == 'direct' else seen};")
+            found.append("if (!(opacity > 0.0)) return;")
+    return found
 
 
 def _features(program: Program) -> list[str]:
     lines = []
     for texture in [*program.textures, *([program.scaling] if program.scaling else [])]:
         moves = []
-        if program.depth is not None and texture.view:
-            way = "toward" if curved(program) else "btfkit_step(view)"
-            moves.append(f"{literal(texture.view)} * {way}")
-        if program.depth is not None and texture.light:
-            way = "away" if curved(program) else "btfkit_step(light)"
-            moves.append(f"{literal(-texture.light)} * {way}")
-        place = f"uv + depth * ({' + '.join(moves)})" if moves else "uv"
+        if isinstance(program.depth, OffsetNetwork):
+            place = f"uv + {literal(texture.view)} * offset" if texture.view else "uv"
+        else:
+            if program.depth is not None and texture.view:
+                way = "toward" if program.curved else "btfkit_step(view)"
+                moves.append(f"{literal(texture.view)} * {way}")
+            if program.depth is not None and texture.light:
+                way = "away" if program.curved else "btfkit_step(light)"
+                moves.append(f"{literal(-texture.light)} * {way}")
+            place = f"uv + depth * ({' + '.join(moves)})" if moves else "uv"
         lines += _called(texture, place, "level")
     return lines
 
@@ -298,6 +297,8 @@ def reflectance(program: Program, heads: dict[str, list[str]]) -> list[str]:
     c, most = len(program.channels), literal(MOST_LOG)
     if program.output == "cosine":
         return [f"{x} * light.z" for x in heads["linear"]]
+    if program.output == "linear":
+        return [f"max({x}, 0.0)" for x in heads["linear"]]
     if program.output == "released":
         logs = [f"min({x}, {most})" for x in heads["log"]]
         sums = [
