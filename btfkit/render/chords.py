@@ -93,20 +93,6 @@ def chords(
     return Chord(rows, seen, 2 * turn / way)
 
 
-def rotation(start: Floats, end: Floats) -> Floats:
-    """(m, 3, 3) rotations that take unit vectors (m, 3) to others by the shortest way.
-
-    Source: Rodrigues' formula without angles; start and end are nowhere opposite here.
-    """
-    axis = np.cross(start, end)
-    cosine = np.einsum("ij,ij->i", start, end)
-    cross = np.zeros((len(axis), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]] = axis
-    cross[:, [1, 2, 0], [2, 0, 1]] = -axis
-    share = 1 / np.maximum(1 + cosine, 1e-6)
-    return np.eye(3) + cross + share[:, None, None] * (cross @ cross)
-
-
 def half_turn(ratio: Floats) -> Floats:
     """Half the angle (m,) of arcs, by their greatest depth under the chord over their length."""
     turn = 4 * ratio

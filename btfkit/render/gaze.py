@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.directions import rotation
 from btfkit.materials.base import Material
-from btfkit.render.chords import chords, rotation
+from btfkit.render.chords import chords
 from btfkit.shapes.closed import Floats, Shape, Surface
 
 # Interpolated normals may turn from the eye at silhouettes; a material is seen from above.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from btfkit.render.chords import chords, half_turn, rotation
+from btfkit.directions import rotation
+from btfkit.render.chords import chords, half_turn
 from btfkit.render.gaze import dot, uv_step
 from btfkit.shapes.catalogue import shape_of
 from btfkit.shapes.closed import Shape, Surface
