@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from btfkit.conventions import MOST_BEND, displacement
 from btfkit.native.neural import bent
 from btfkit.native.neural.layout import Array
 from btfkit.native.neural.lookup import bilinear
@@ -48,18 +49,20 @@ def carved(
     assert queries.opacity is not None
     if queries.curvature is None:
         return None
-    convex = np.flatnonzero(queries.curvature > 0)
+    convex = np.flatnonzero((queries.curvature > 0) & (queries.view[:, 2] > 0))
+    if opacity is not None:
+        convex = convex[_clear(queries, convex, opacity, scale, aspect, wrap)]
     passing = convex[queries.opacity[convex] < _NOTHING]
     if not len(passing):
         return None
-    heights = _ceiling(queries, passing, size, scale, aspect, wrap, opacity)
-    if heights is None:
-        return None
-    bottom = float(heights.min())
-    reaches = _rays(queries, convex, scale, aspect, bottom)[0].reaches
-    band = convex[~reaches]
-    if opacity is not None:
-        band = band[_clear(queries, band, opacity, scale, aspect, bottom, wrap)]
+    # The deepest place of a ray, were nothing in its way: a relief that it passes reaches so far,
+    # but not to the axis of the sharpest surface that it lay under.
+    bend = queries.curvature * np.float32(scale)
+    lowest = (1 - np.hypot(*queries.view.T[:2])) / np.where(bend > 0, bend, 1)
+    bottom = -min(float(lowest[passing].max()), MOST_BEND / float(bend.max()))
+    heights = _ceiling(queries, passing[lowest[passing] <= -bottom], size, scale, aspect, wrap)
+    heights = np.clip(heights, bottom, 0)
+    band = convex[lowest[convex] <= -bottom]
     rng, count = np.random.default_rng(seed), min(_SWEPT * heights.size, _MOST_SWEPT, len(band))
     for _ in range(_SWEEPS):
         rows = rng.choice(band, count, replace=False)
@@ -72,33 +75,28 @@ def carved(
     return heights
 
 
-def _rays(
-    queries: QuerySet, rows: NDArray[np.intp], scale: float, aspect: float, bottom: float
+def _chords(
+    queries: QuerySet, rows: NDArray[np.intp], scale: float, aspect: float
 ) -> tuple[bent.Rays, Array]:
-    """Rays of some queries over heights that reach down to `bottom`, and their uv (b, 2)."""
+    """Rays of queries on convex surfaces as they go where nothing stops them, and their uv (b, 2).
+
+    Lengths are units of the heights.
+    """
     assert queries.curvature is not None
-    span = Heights(np.array([[0, bottom]], np.float32), scale, curved=True)
-    return bent.rays_of(span, queries.view[rows], queries.curvature[rows], aspect), queries.uv[rows]
+    (x, y, z), bend = queries.view[rows].T, queries.curvature[rows] * np.float32(scale)
+    flat = np.maximum(np.hypot(x, y), 1e-6)
+    along = np.stack(displacement(-x, -y, flat / scale, aspect), axis=1)
+    none, stop = np.zeros_like(z), 2 * np.arctan2(z, flat) / bend
+    return bent.Rays(bend, flat, z, along, none, none, stop, none > 0), queries.uv[rows]
 
 
 def _ceiling(
-    queries: QuerySet,
-    rows: NDArray[np.intp],
-    size: tuple[int, int],
-    scale: float,
-    aspect: float,
+    queries: QuerySet, rows: NDArray[np.intp], size: tuple[int, int], scale: float, aspect: float,
     wrap: bool,
-    opacity: Array | None,
-) -> Array | None:
+) -> Array:  # fmt: skip
     """The heights (h, w) under which rays that passed went; where none went, those around."""
-    assert queries.curvature is not None
     h, w = size
-    # The lowest that a ray passed: the bottom lies there or deeper, and none of them reached it.
-    bend = queries.curvature[rows] * scale
-    lowest = float(((1 - np.hypot(*queries.view[rows, :2].T)) / bend).max()) * 1.001
-    if opacity is not None:
-        rows = rows[_clear(queries, rows, opacity, scale, aspect, -lowest, wrap)]
-    rays, uv = _rays(queries, rows, scale, aspect, -lowest)
+    rays, uv = _chords(queries, rows, scale, aspect)
     found = np.full(h * w, np.inf, np.float32)
     for k in range(1, _CARVED):
         way = rays.start + (rays.stop - rays.start) * np.float32(k / _CARVED)
@@ -107,11 +105,9 @@ def _ceiling(
         at = _texel(uv + way[:, None] * rays.along, size, wrap=wrap)
         np.minimum.at(found, at, bent.height_at(rays, way).astype(np.float32))
     known = np.isfinite(found)
-    if not known.any():
-        return None
     if not known.all():
         found = _filled(found.reshape(size), known.reshape(size), wrap=wrap).ravel()
-    return np.minimum(found, 0).reshape(size)
+    return found.reshape(size)
 
 
 def _filled(values: Array, known: NDArray[np.bool_], *, wrap: bool) -> Array:
@@ -131,10 +127,10 @@ def _filled(values: Array, known: NDArray[np.bool_], *, wrap: bool) -> Array:
 
 def _clear(
     queries: QuerySet, rows: NDArray[np.intp], opacity: Array, scale: float, aspect: float,
-    bottom: float, wrap: bool,
+    wrap: bool,
 ) -> NDArray[np.bool_]:  # fmt: skip
     """(b,) whether the ways of rays cross no hole."""
-    rays, uv = _rays(queries, rows, scale, aspect, bottom)
+    rays, uv = _chords(queries, rows, scale, aspect)
     solid, clear = opacity.ravel() >= 0.5, np.ones(len(rows), bool)
     for k in range(_CARVED + 1):
         way = rays.start + (rays.stop - rays.start) * np.float32(k / _CARVED)
