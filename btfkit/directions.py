@@ -135,6 +135,22 @@ def checked(name: str, direction: ArrayLike, *, upper: bool) -> NDArray[np.float
     return unit.astype(np.float32)
 
 
+def rotation(start: Floats, end: Floats) -> Floats:
+    """(m, 3, 3) rotations that take unit vectors (m, 3) to others by the shortest way.
+
+    Towards the opposite vector there is no shortest way; what is answered there is no rotation.
+
+    Source: Rodrigues' formula without angles.
+    """
+    axis = np.cross(start, end)
+    cosine = np.einsum("ij,ij->i", start, end)
+    cross = np.zeros((len(axis), 3, 3))
+    cross[:, [2, 0, 1], [1, 2, 0]] = axis
+    cross[:, [1, 2, 0], [2, 0, 1]] = -axis
+    share = 1 / np.maximum(1 + cosine, 1e-6)
+    return np.eye(3) + cross + share[:, None, None] * (cross @ cross)
+
+
 def half_difference(light: ArrayLike, view: ArrayLike) -> tuple[Floats, Floats]:
     """Half vector and difference vector of a direction pair.
 

@@ -15,9 +15,9 @@ import numpy as np
 from btfkit.conventions import MOST_BEND
 from btfkit.shapes.closed import NEAR, Floats, Meeting, Plane, Shape, Surface
 
-# Views steeper than this reach the bottom soon, and so do rays that go this many times deeper than
-# the material: to them the entry says more.
-_STEEPEST, _DEEPEST = 0.7, 1.5
+# Views steeper than this reach the bottom soon, unless the circle of the entry takes them no deeper
+# than so many thicknesses; to rays whose chords go deeper than so many the entry says more.
+_STEEPEST, _SHALLOW, _DEEPEST = 0.7, 2.0, 1.5
 # Tiles by which uv at the far end may differ from what the entry lets expect; beyond lies a seam.
 _FARTHEST = 0.35
 # Lengths in uv of their chords, tiles, at least: at a pole uv has no length, and curvature no end.
@@ -45,6 +45,7 @@ def chords(
     toward: Floats,
     view: Floats,
     step: Floats,
+    curvature: Floats,
     *,
     aspect: float,
     thickness: float,
@@ -56,9 +57,12 @@ def chords(
         toward: (m, 3) unit vectors to the viewer, object frame.
         view: (m, 3) in the frame of the surface.
         step: (m, 2) in uv, tiles, of a unit of length along the ray at the entry.
+        curvature: (m,) of the entry along the ray, 1/tile width.
         aspect: tile width / tile height. thickness: of the material, tile widths.
     """
-    rows = np.flatnonzero(view[:, 2] < _STEEPEST)
+    above = 1 - np.hypot(view[:, 0], view[:, 1])
+    passing = (view[:, 2] < _STEEPEST) | (above < _SHALLOW * thickness * curvature)
+    rows = np.flatnonzero(passing)
     if isinstance(shape, Plane) or not thickness or not rows.size:
         return None
     origin, direction = surface.point[rows], -toward[rows]
@@ -78,7 +82,12 @@ def chords(
     lifted = shape.meet(middle, up, np.zeros(len(rows)))
     depth = lifted.distance / shape.tile
     moved = end.uv - surface.uv[rows]
-    expected = step[rows] * met.distance[:, None]
+    # Along the arc with the chord's length and its middle's depth; a ray that is nearly straight
+    # down crosses the body, and its way over the surface is far longer.
+    arc = 2 * np.arctan(2 * lifted.distance / met.distance)
+    stretched = met.distance * arc / np.sin(arc)
+    flattened = np.maximum(np.hypot(view[rows, 0], view[rows, 1]), 1e-9)
+    expected = step[rows] * (stretched / flattened)[:, None]
     # Whole tiles are the same place.
     moved = moved - np.round(moved - expected)
     far = np.abs(moved - expected).max(axis=1)
@@ -91,20 +100,6 @@ def chords(
     side = np.cos(turn) / way
     seen = np.stack([-flat[:, 0] * side, flat[:, 1] * side, np.sin(turn)], axis=1)
     return Chord(rows, seen, 2 * turn / way)
-
-
-def rotation(start: Floats, end: Floats) -> Floats:
-    """(m, 3, 3) rotations that take unit vectors (m, 3) to others by the shortest way.
-
-    Source: Rodrigues' formula without angles; start and end are nowhere opposite here.
-    """
-    axis = np.cross(start, end)
-    cosine = np.einsum("ij,ij->i", start, end)
-    cross = np.zeros((len(axis), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]] = axis
-    cross[:, [1, 2, 0], [2, 0, 1]] = -axis
-    share = 1 / np.maximum(1 + cosine, 1e-6)
-    return np.eye(3) + cross + share[:, None, None] * (cross @ cross)
 
 
 def half_turn(ratio: Floats) -> Floats:

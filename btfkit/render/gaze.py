@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.directions import rotation
 from btfkit.materials.base import Material
-from btfkit.render.chords import chords, rotation
+from btfkit.render.chords import chords
 from btfkit.shapes.closed import Floats, Shape, Surface
 
 # Interpolated normals may turn from the eye at silhouettes; a material is seen from above.
@@ -59,8 +60,10 @@ def gaze(material: Material, shape: Shape, surface: Surface, toward: Floats, pix
         along = _bend_along(surface.bend, dot(x, toward), dot(right_handed, toward))
         curvature = side * shape.tile * along
         ray = uv_step(surface, dot(surface.normal, toward)[:, None] * surface.normal - toward)
+        # Seen from within, nothing is grazed.
+        outer = np.where((side > 0)[:, None], view, np.array([0.0, 0.0, 1.0]))
         found = chords(
-            shape, surface, toward, np.where((side > 0)[:, None], view, 1.0), ray,
+            shape, surface, toward, outer, ray, np.where(side > 0, curvature, 0.0),
             aspect=material.header.aspect, thickness=material.thickness,
         )  # fmt: skip
         if found is not None:

@@ -1,4 +1,4 @@
-"""A triangle mesh as a shape: smooth normals, uv steps and curvature of each triangle."""
+"""A triangle mesh as a shape: smooth normals and curvature, uv steps of each triangle."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import ClassVar, final
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.shapes.bending import along_frame, vertex_forms, vertices
 from btfkit.shapes.bvh import Ints
 from btfkit.shapes.closed import Floats, Meeting, Shape, Surface
 from btfkit.shapes.embree import rays_to
@@ -17,8 +18,9 @@ from btfkit.shapes.triangles import Triangles
 class Mesh(Shape):
     """A mesh, moved to the centre of its box and scaled into the unit sphere.
 
-    Curvature is that of each triangle's normals, so faceted meshes have none. A triangle whose
-    texture coordinates have no area keeps a frame of its own and shows one texel.
+    Curvature is that of its vertices, interpolated for any tangent (`bending`), and theirs that of
+    the normals around, so faceted meshes have none. A triangle whose texture coordinates have no
+    area keeps a frame of its own and shows one texel.
 
     Args:
         triangles: what it is made of.
@@ -43,7 +45,9 @@ class Mesh(Shape):
         # Rows run down from the top, v of an OBJ up from the bottom.
         self._uv = (triangles.uv * [1, -1] + [0, 1]) * [repeat, repeat * aspect]
         self._du, self._dv = _uv_edges(edges, self._uv)
-        self._bend = self._shape_operator(edges)
+        index = vertices(self._corner, self._normal)
+        self._form = vertex_forms(self._corner, self._normal, index, int(index.max()) + 1)
+        self._vertex = index
         width = np.linalg.norm(self._du, axis=1)
         self.tile = float(np.average(width, weights=area))
         self._tree = rays_to(self._corner)
@@ -70,32 +74,15 @@ class Mesh(Shape):
         lift = np.minimum(below, 0)[..., None] * self._normal[face]
         start = point - np.einsum("ij,ijk->ik", weight, lift)
         uv = np.einsum("ij,ijk->ik", weight, self._uv[face])
-        return Surface(
-            point, normal, flat, uv, self._du[face], self._dv[face], self._bend[face], start
-        )
+        form = np.einsum("ij,ijkl->ikl", weight, self._form[self._vertex[face]])
+        bend = np.stack(along_frame(form, normal, self._du[face]), axis=1)
+        return Surface(point, normal, flat, uv, self._du[face], self._dv[face], bend, start)
 
     def _barycentric(self, point: Floats, face: Ints) -> Floats:
         """Barycentric coordinates (m, 3) of points on triangles."""
         first, second, third = np.moveaxis(self._corner[face], 1, 0)
         b, c = _solved(second - first, third - first, point - first)
         return np.clip(np.stack([1 - b - c, b, c], axis=1), 0, 1)
-
-    def _shape_operator(self, edges: Floats) -> Floats:
-        """Second fundamental form (f, 3) in the frame of du and the normal, from corner normals.
-
-        Source: Rusinkiewicz, "Estimating Curvatures and Their Derivatives on Triangle Meshes",
-        2004, section 3.1; with the two edges from the first corner alone.
-        """
-        x = self._du - self._flat * np.einsum("ij,ij->i", self._du, self._flat)[:, None]
-        x = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-30)
-        frame = np.stack([x, np.cross(self._flat, x)], axis=1)
-        turns = self._normal[:, 1:] - self._normal[:, :1]
-        step, turn = (np.einsum("fak,fek->fae", frame, d) for d in (edges, turns))
-        # Closed form: a general inverse of a million small matrices takes half a minute.
-        (a, b), (c, d) = np.moveaxis(step, 0, -1)
-        inverse = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], -2)
-        form = turn @ (inverse / (a * d - b * c)[:, None, None])
-        return np.stack([form[:, 0, 0], (form[:, 0, 1] + form[:, 1, 0]) / 2, form[:, 1, 1]], axis=1)
 
 
 def _solved(e1: Floats, e2: Floats, step: Floats) -> tuple[Floats, Floats]:

@@ -6,16 +6,18 @@ there of opacity and offset is geometry here, docs/sbtf.md has the comparison.
 
 from __future__ import annotations
 
-from typing import ClassVar, final
+from typing import Any, ClassVar, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from btfkit.btf import BTF
 from btfkit.errors import FitError
+from btfkit.fitting.neumip.data import Source
 from btfkit.fitting.neumip.settings import INPUTS
 from btfkit.fitting.neumip.trainable import Marching
 from btfkit.fitting.sbtf import holes
-from btfkit.fitting.sbtf.outlines import moved
+from btfkit.fitting.sbtf.outlines import carved, moved
 from btfkit.fitting.sbtf.settings import Settings
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.spec import NeuMIPSpec
@@ -40,6 +42,8 @@ class SBTF(Marching[Settings]):
     _given: Array | None = None
     _opacity: Array | None = None
     _thickness: float = 0.0
+    # Valid rows of queries that are trained on.
+    _known: QuerySet | None = None
 
     def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:
         s, source = self.settings, self._data
@@ -76,14 +80,40 @@ class SBTF(Marching[Settings]):
             return self.settings.holes == "true"
         return isinstance(self._data, QuerySet) and holes.seen_through(self._data)
 
+    def _batches(
+        self,
+        source: BTF | QuerySet,
+        train: NDArray[np.intp],
+        test: NDArray[np.intp],
+        progress: Any,
+    ) -> Source:
+        if isinstance(source, QuerySet):
+            rows = source.subset(train)
+            self._known = rows.subset(rows.valid())
+        return super()._batches(source, train, test, progress)
+
     def _begin(self, rng: np.random.Generator) -> None:
         super()._begin(rng)
         if self.spec.holes:
-            assert isinstance(self._data, QuerySet)
-            valid = self._data.subset(self._data.valid())
-            self._opacity = holes.opacity_of(valid, self.spec.size, wrap=self.layout.wrap)
+            assert self._known is not None
+            self._opacity = holes.opacity_of(self._known, self.spec.size, wrap=self.layout.wrap)
+        self._begin_carved()
+        if self.spec.holes:
             self._look_for_thickness()
             self._keep_given()
+
+    def _begin_carved(self) -> None:
+        """Begin with the heights that outlines tell, where heights are not known."""
+        if self._known is None or not self._outlined or self.settings.heights == "given":
+            return
+        layout = self.layout
+        heights = carved(
+            self._known, self.spec.size, scale=layout.depth_scale, aspect=layout.aspect,
+            wrap=layout.wrap, opacity=self._opacity, seed=self._generators.seed,
+        )  # fmt: skip
+        if heights is not None:
+            _, texels = self.engine.parameters()
+            layout.surface(texels)[...] = heights
 
     def know(self, relief: Relief) -> None:
         """Take the heights, and the holes, of the relief behind the data, its top at 0."""
@@ -152,14 +182,14 @@ class SBTF(Marching[Settings]):
     def _look_for_thickness(self) -> None:
         """How far the sheet reaches down, from the heights as they are and the rays that pass."""
         assert self._opacity is not None
-        assert isinstance(self._data, QuerySet)
+        assert self._known is not None
         scale = self.layout.depth_scale
         if self.settings.thickness:
             self._thickness = self.settings.thickness / scale
             return
         _, texels = self.engine.parameters()
         self._thickness = holes.thickness_of(
-            self.layout.surface(texels), self._opacity, self._data.subset(self._data.valid()),
+            self.layout.surface(texels), self._opacity, self._known,
             scale=scale, aspect=self.layout.aspect, wrap=self.layout.wrap,
         )  # fmt: skip
 

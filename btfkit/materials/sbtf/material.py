@@ -21,14 +21,21 @@ from numpy.typing import NDArray
 from btfkit.materials.base import Array, Header
 from btfkit.materials.neumip.material import NeuMIPMaterial
 from btfkit.materials.neumip.spec import NeuMIPSpec
+from btfkit.materials.sbtf.footprints import softened
 from btfkit.native.neural import bent, plain
 from btfkit.program import Heights
 from btfkit.queries import Query
+
+# Standard deviation, texels, of the footprint of one texel, with room for a rounding.
+_SHARP = 0.5001
 
 
 @final
 class SBTF(NeuMIPMaterial):
     """NeuMIP with silhouettes, on planes and under curved surfaces.
+
+    Opacity is that of a ray; under a footprint wider than a texel the share of its rays that are
+    stopped, and the answer is the mean of theirs.
 
     Attributes:
         thickness: from the surface to the lowest height, tile widths; of a material with holes, to
@@ -50,20 +57,39 @@ class SBTF(NeuMIPMaterial):
         super().__init__(spec, weights, header)
         found = self._program.depth
         assert isinstance(found, Heights)
+        self._depth = found
         self.thickness = max(-float(found.heights.min()), 0.0) * found.scale
         self.sharpest = bent.sharpest(found)
 
     def _answer(self, query: Query) -> tuple[Array, Array | None]:
+        return softened(query, self._may_pass(query), self.header.grid, self._answer_sharp)
+
+    def _answer_lights(self, query: Query) -> tuple[Array, Array | None]:
+        return softened(query, self._may_pass(query), self.header.grid, self._answer_lights_sharp)
+
+    def _may_pass(self, query: Query) -> NDArray[np.intp]:
+        """Rows whose footprint is wider than a texel and of which a part may pass."""
+        wide = np.flatnonzero(query.footprint > _SHARP)
+        if not len(wide) or self.spec.holes:
+            return wide
+        bend = self._bend(query)
+        if bend is None:
+            return wide[:0]
+        rays = bent.rays_of(self._depth, query.view[wide], bend[wide], self.header.aspect)
+        return np.asarray(wide[~rays.reaches], np.intp)
+
+    def _answer_sharp(self, query: Query) -> tuple[Array, Array]:
         bend, footprint = self._bend(query), self._footprint(query)
         parts = (query.uv, query.light, query.view, footprint, bend)
         if self._kernel is None:
-            answer, opacity = plain.answer(self._program, *parts)
+            answer, found = plain.answer(self._program, *parts)
+            opacity = np.ones(len(answer), np.float32) if found is None else found
         else:
             opacity = np.empty(len(query.uv), np.float32)
             answer = self._kernel.evaluate(self.flat, self.texels, *parts, opacity=opacity)
         return answer.astype(np.float32, copy=False), opacity.astype(np.float32, copy=False)
 
-    def _answer_lights(self, query: Query) -> tuple[Array, Array | None]:
+    def _answer_lights_sharp(self, query: Query) -> tuple[Array, Array]:
         assert self._kernel is not None
         bend, opacity = self._bend(query), np.empty(len(query.uv), np.float32)
         parts = (query.uv, query.light, query.view, self._footprint(query), bend)
