@@ -63,11 +63,12 @@ def markdown(results: Mapping[str, Any]) -> str:
 
 
 def stages(found: Mapping[str, Sequence[Row]]) -> list[str]:
-    """A table a stage of the calibration."""
+    """A table a stage."""
     titles = {
         "merge": "Merging: relative deviation by decade of electrons a second",
         "bundle": "Adjustment of a rig, by views",
         "rectify": "Rectification, signal to noise",
+        "heightfield": "Heights of traced cobbles, errors in texels",
     }
     return [f"## {titles[name]}\n\n{generic(rows)}" for name, rows in found.items()]
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @verb(
     "bench",
     example="""btfkit bench cobbles wool.btf.zarr --model neumip --model pca --quick
-btfkit bench merge bundle rectify -o stages
+btfkit bench merge bundle rectify heightfield -o stages
 btfkit bench wool.btf.zarr --questions && btfkit bench wool.btf.zarr --answers ours=answers.npz""",
 )
 @click.argument("names", nargs=-1)
@@ -68,7 +68,8 @@ def bench_verb(
     """Fit models to materials within budgets, and write what each cost and how far off it is.
 
     NAMES: materials of `btfkit synth --list`, or stores, query files and whatever else `ingest`
-    reads; merge, bundle and rectify measure those stages of a calibration by themselves. Writes
+    reads; merge, bundle and rectify measure those stages of a calibration by themselves,
+    heightfield each source of heights and all in one. Writes
     bench.json, tables (bench.md, bench.csv, bench.tex) and two plots of all that the folder holds:
     what former calls finished is kept and told with the rest, so that models, budgets and
     materials may be run one after the other, or by several processes at a time; --cluster gives

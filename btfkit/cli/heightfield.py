@@ -26,7 +26,8 @@ btfkit heightfield wool.neumip.safetensors""",
 @out_option("*.exr; by default the source's name with .relief.exr, here")
 @click.option("--mesh", type=click.Path(path_type=Path), help="Also *.obj, *.ply or *.stl.")
 @click.option("--report", is_flag=True, help="Also OUT.report.json and OUT.report.html.")
-@click.option("--truth", type=click.Path(path_type=Path), help="The relief as known: errors.")
+@click.option("--truth", type=click.Path(path_type=Path),
+              help="The relief as known: errors. `synth` leaves it in what it traces.")  # fmt: skip
 @click.option("--model", type=click.Path(path_type=Path),
               help="A neumip of this BTF: its heights instead of a fit.")  # fmt: skip
 @click.option("--budget", type=DurationType(), default="20s", show_default=True,
@@ -56,7 +57,7 @@ def heightfield_verb(
     SOURCE: a native store, anything `btfkit ingest` reads, or a fitted neumip.
     """
     from btfkit.files import refuse_existing
-    from btfkit.fitting.heightfield.accuracy import against_truth, rerendered
+    from btfkit.fitting.heightfield.accuracy import against_truth, rerendered, truth_of
     from btfkit.fitting.heightfield.report import write_html, write_json
     from btfkit.relief.file import read, write
     from btfkit.relief.mesh import check_name, write_mesh
@@ -78,8 +79,10 @@ def heightfield_verb(
     known = None if truth is None else read(truth)
     found, btf = _found(source, model, budget, holdout, seed, bar)
     figures: dict[str, Any] = {**names, **found.figures, "rerendered": rerendered(found, btf)}
+    by = "--truth" if known is not None else "provenance"
+    known = truth_of(btf) if known is None else known
     if known is not None:
-        figures["truth"] = against_truth(found, known)
+        figures["truth"] = {"known_by": by, **against_truth(found, known)}
     relief = _of_three(found.relief)
     unit = "mm" if relief.texel_mm else "texel"
     write(relief, final, unit=unit, force=force)

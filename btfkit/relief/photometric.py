@@ -29,8 +29,12 @@ _FLATTEST_SPAN = 0.02
 # What gloss is taken for where the data do not say.
 _GLOSS, _ROUGHNESS = 0.04, 0.4
 _STEEPEST = 0.05
+# Pairs count by this power of the view's cosine: measured, see docs/heightfields.md.
+_UPRIGHT = 4.0
 # A slope known to this deviation has half the confidence of one known exactly.
 _HALF_SLOPE = 0.05
+# Systematic part of a slope's error: interpolation, reflectance that is no single lobe.
+SLOPE_ERROR = 0.03
 # Values that a block of rows may hold.
 _MOST_VALUES = 1 << 24
 
@@ -45,7 +49,6 @@ class Normals:
         variance: (h, w, 3) of the slopes, xx, xy, yy; infinite where nothing was found.
         albedo, specular, roughness: (h, w) grey reflectance, as in `Maps`.
         deviation: (h, w) robust, of the values.
-    specular, roughness: (h, w) of the gloss, grey.
         kept: (h, w) share of the values that the reflectance explains.
         confidence: (h, w) 0..1.
     """
@@ -95,18 +98,25 @@ def photometric_stereo(
     h, w = stack.size
     flat = np.zeros((h, w), np.float32) if height is None else height
     grey = stack.grey
+    upright = _upright(stack)
     parts: list[Lobes] = []
     step = max(_MOST_VALUES // (w * len(stack.pairs)), 1)
     for first in range(0, h, step):
         rows = slice(first, min(first + step, h))
         values = stack.seen(grey, flat, rows)
-        weight = _weights(values, visible, rows)
+        weight = _weights(values, visible, rows) * upright
         begin = None if start is None else start.lobes(rows)
         parts.append(_fitted(stack, values, weight, stack.place(flat, rows), begin))
         if progress:
             progress(rows.stop, h)
     whole = [np.concatenate([part[k] for part in parts]) for k in range(len(parts[0]))]
     return _normals(Lobes(*whole), (h, w))
+
+
+def slope_weights(normals: Normals) -> Array:
+    """(h, w, 2) weights of the slopes, for integration."""
+    by = 1 / (normals.variance[..., [0, 2]] + SLOPE_ERROR**2)
+    return by.astype(np.float32)
 
 
 def check_lights(stack: Stack) -> None:
@@ -171,6 +181,12 @@ def normal_of(slope: Floats) -> Array:
     """(..., 3) unit normals of slopes (..., 2) dz/dx, dz/dy."""
     n = np.concatenate([-slope, np.ones((*slope.shape[:-1], 1))], axis=-1)
     return (n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def _upright(stack: Stack) -> Array:
+    """(n,) weights of pairs, 1 of the most upright view: flat ones see texels drawn out."""
+    z = np.maximum(stack.view[:, 2], 0) / max(float(stack.views[:, 2].max()), 1e-6)
+    return (z**_UPRIGHT).astype(np.float32)
 
 
 def _weights(values: Array, visible: NDArray[np.bool_] | None, rows: slice) -> Array:

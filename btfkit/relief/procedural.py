@@ -49,8 +49,15 @@ def make(
     function, default = CATALOGUE[name]
     texels = default if relief_texels is None else relief_texels
     if wrap == "wrap":
-        return function(size, texels / size, np.random.default_rng(seed))
-    return _corner(_larger(function, size, texels, seed), size)
+        made = function(size, texels / size, np.random.default_rng(seed))
+    else:
+        made = _corner(_larger(function, size, texels, seed), size)
+    recipe = {"name": name, "size": size, "relief_texels": texels, "seed": seed, "wrap": wrap}
+    return replace(made, provenance={**made.provenance, RECIPE: recipe})
+
+
+# Key of a provenance under which `make` leaves its own arguments.
+RECIPE = "procedural"
 
 
 def described() -> dict[str, str]:

@@ -153,27 +153,27 @@ def read_stack(btf: BTF, *, progress: Progress | None = None) -> Stack:
     Raises:
         ValueError: no pair is lit from above the horizon.
     """
-    chosen = _chosen(btf)
-    lights, light_of = directions.unique(btf.light[chosen])
-    views, view_of = directions.unique(btf.view[chosen])
+    pairs = chosen(btf)
+    lights, light_of = directions.unique(btf.light[pairs])
+    views, view_of = directions.unique(btf.view[pairs])
     order = np.argsort(view_of, kind="stable")
-    chosen, light_of, view_of = chosen[order], light_of[order], view_of[order]
+    pairs, light_of, view_of = pairs[order], light_of[order], view_of[order]
     _, h, w, c = btf.shape
-    values = np.empty((h, w, len(chosen), c), np.float16)
+    values = np.empty((h, w, len(pairs), c), np.float16)
     unmeasured = saturated = 0
-    for start in range(0, len(chosen), 8):
-        run = slice(start, min(start + 8, len(chosen)))
+    for start in range(0, len(pairs), 8):
+        run = slice(start, min(start + 8, len(pairs)))
         # A copy: textures in memory are given as they lie there.
-        images = np.array(btf.batch(chosen[run]), np.float32)
+        images = np.array(btf.batch(pairs[run]), np.float32)
         unmeasured += int((~np.isfinite(images)).any(axis=-1).sum())
         saturated += _leave_out_clipped(images)
         values[:, :, run] = images.transpose(1, 2, 0, 3)
         if progress:
-            progress(run.stop, len(chosen))
+            progress(run.stop, len(pairs))
     return Stack(
-        values=values, pairs=chosen, light=btf.light[chosen], view=btf.view[chosen],
-        light_near=_in_texels(btf.light_position, chosen, btf.texel_mm),
-        view_near=_in_texels(btf.view_position, chosen, btf.texel_mm),
+        values=values, pairs=pairs, light=btf.light[pairs], view=btf.view[pairs],
+        light_near=_in_texels(btf.light_position, pairs, btf.texel_mm),
+        view_near=_in_texels(btf.view_position, pairs, btf.texel_mm),
         light_of=light_of, view_of=view_of, lights=lights, views=views,
         wrap=btf.wrap == "wrap", unmeasured=unmeasured, saturated=saturated,
     )  # fmt: skip
@@ -219,8 +219,12 @@ def visibility(height: Array, towards: Array, *, wrap: bool) -> NDArray[np.bool_
     return found
 
 
-def _chosen(btf: BTF) -> NDArray[np.intp]:
-    """Pairs lit from above, of spread lights and views where there are many."""
+def chosen(btf: BTF) -> NDArray[np.intp]:
+    """Pairs that `read_stack` reads: lit from above, of spread lights and views if many.
+
+    Raises:
+        ValueError: no pair is lit from above the horizon.
+    """
     good = (btf.light[:, 2] > 0) & (btf.view[:, 2] > 0.05)
     if not good.any():
         raise ValueError("no pair is lit from above the horizon")

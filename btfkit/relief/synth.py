@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,6 +41,26 @@ def direction_set(name: str) -> NDArray[np.float32]:
     return directions.from_angles(np.radians(theta), np.radians(np.rint(azimuth % 360))).astype(
         np.float32
     )
+
+
+def known(provenance: Mapping[str, Any], size: tuple[int, int]) -> Relief | None:
+    """The relief of `size` (h, w) that a provenance names: of a traced BTF, or a model of one.
+
+    None where it names none, one of another size, or one that this version cannot make.
+    """
+    recipe = provenance.get(procedural.RECIPE)
+    if isinstance(recipe, Mapping):
+        if size != (recipe.get("size"),) * 2:
+            return None
+        try:
+            return procedural.make(
+                str(recipe["name"]), size[0], relief_texels=float(recipe["relief_texels"]),
+                seed=int(recipe["seed"]), wrap=recipe["wrap"],
+            )  # fmt: skip
+        except (KeyError, TypeError, ValueError):
+            return None
+    data = provenance.get("data")
+    return known(data, size) if isinstance(data, Mapping) else None
 
 
 def synth_btf(

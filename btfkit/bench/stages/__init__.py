@@ -1,4 +1,4 @@
-"""Stages of a calibration measured by themselves: error against CPU seconds at three sizes."""
+"""Stages measured by themselves: error against CPU seconds at three sizes."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ STAGES: dict[str, str] = {
     "merge": "btfkit.bench.stages.merge:cells",
     "bundle": "btfkit.bench.stages.bundle:cells",
     "rectify": "btfkit.bench.stages.rectify:cells",
+    "heightfield": "btfkit.bench.stages.heightfield:cells",
 }
 
 

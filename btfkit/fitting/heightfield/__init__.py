@@ -17,12 +17,18 @@ from numpy.typing import NDArray
 from btfkit.btf import BTF, Wrap
 from btfkit.fitting.analytic import Maps, fit_maps
 from btfkit.fitting.heightfield import orientation
+from btfkit.fitting.heightfield.alone import SWEEPS, by_light
 from btfkit.fitting.heightfield.bounds import shadow_bounds
 from btfkit.fitting.heightfield.fusion import Fused, fuse
 from btfkit.fitting.heightfield.parallax import Sweep, disagreement, fitted_heights, reached, sweep
 from btfkit.heldout import split
 from btfkit.relief.integration import integrate
-from btfkit.relief.photometric import Normals, check_lights, photometric_stereo
+from btfkit.relief.photometric import (
+    Normals,
+    check_lights,
+    photometric_stereo,
+    slope_weights,
+)
 from btfkit.relief.relief import Relief
 from btfkit.relief.stack import Stack, read_stack, visibility
 from btfkit.textures import as_textures
@@ -30,12 +36,6 @@ from btfkit.textures import as_textures
 Array = NDArray[np.float32]
 Progress = Callable[[int, int], None]
 
-# Steps of the sweep, texels: each round looks closer.
-_SWEEPS = (1.0, 0.5, 0.25, 0.12)
-# Rounds of normals and own visibility where there is no parallax.
-_ROUNDS = 2
-# Floor of a slope's error, as in the fusion.
-_SLOPE_ERROR = 0.03
 # Height error at which confidence is a half, texels.
 _HALF_HEIGHT = 0.25
 _MOST_HELD = 12
@@ -55,7 +55,8 @@ class Found:
         normals: of photometric stereo.
         heights: (h, w) of each source in texels: "normals", "parallax", "fusion".
         deviation: (h, w) expected error of the heights, texels; of normals alone NaN.
-        lit, seen: (h, w) shares of lights and of views that reach the surface.
+        lights, views: (k, 3) distinct directions of what was read.
+        lit, seen: (h, w) shares of them that reach the surface.
         maps: the reflectance. held: pairs of the BTF that nothing was fitted to.
         figures: what the report states, JSON types.
     """
@@ -64,6 +65,8 @@ class Found:
     normals: Normals
     heights: Mapping[str, Array]
     deviation: Array
+    lights: Array
+    views: Array
     lit: Array
     seen: Array
     maps: Maps
@@ -76,6 +79,7 @@ def find_relief(
     *,
     budget_s: float = 20.0,
     start: Array | None = None,
+    bounded: bool = True,
     holdout: float = 0.05,
     seed: int = 0,
     progress: Progress | None = None,
@@ -86,6 +90,7 @@ def find_relief(
         btf: what was measured.
         budget_s: wall time for the heights that parallax begins with; the rest takes what it takes.
         start: (h, w) heights in texels that a model already found; None fits one.
+        bounded: whether shadows bound heights from the side.
         holdout: share of the pairs that nothing is fitted to; at most a dozen are kept.
         seed: of all randomness.
         progress: called with (done, total).
@@ -100,7 +105,7 @@ def find_relief(
     check_lights(stack)
     why = _no_parallax(btf, stack)
     if why is None:
-        solved = _with_parallax(btf, stack, budget_s, start, seed, progress)
+        solved = _with_parallax(btf, stack, budget_s, start, bounded, seed, progress)
     else:
         solved = _from_normals(stack)
     height = solved.heights[solved.best]
@@ -141,8 +146,9 @@ def find_relief(
         "cpu_seconds": time.process_time() - cpu,
     }
     return Found(
-        relief, solved.normals, solved.heights, solved.deviation, lit, seen, maps, held, figures
-    )
+        relief, solved.normals, solved.heights, solved.deviation, stack.lights, stack.views,
+        lit, seen, maps, held, figures,
+    )  # fmt: skip
 
 
 @final
@@ -181,23 +187,16 @@ def _no_parallax(btf: BTF, stack: Stack) -> str | None:
 def _is_flat(stack: Stack) -> bool:
     """Whether slopes say so too: structure that repeats hides its own movement."""
     normals = photometric_stereo(stack.for_normals())
-    height = integrate(normals.slope, _weights(normals), wrap=stack.wrap).height
+    height = integrate(normals.slope, slope_weights(normals), wrap=stack.wrap).height
     return float(height.std()) < _FLAT_HEIGHT
 
 
 def _from_normals(stack: Stack) -> _Solved:
     """Heights from slopes alone, solved again with the relief's own shadows."""
     few = stack.for_normals()
-    visible: NDArray[np.bool_] | None = None
-    normals: Normals | None = None
-    turn = 0.0
-    for round_ in range(_ROUNDS):
-        normals = photometric_stereo(few, visible=visible, start=normals)
-        if round_ == 0:
-            turn = orientation.check_lights(normals, wrap=stack.wrap)
-        whole = integrate(normals.slope, _weights(normals), wrap=stack.wrap)
-        visible = visibility(whole.height, few.lights, wrap=stack.wrap)[few.light_of]
-    assert normals is not None
+    first = photometric_stereo(few)
+    turn = orientation.check_lights(first, wrap=stack.wrap)
+    normals, whole = by_light(few, first)
     nothing = np.full(stack.size, np.nan, np.float32)
     figures = {"integration_residual": whole.residual}
     return _Solved(normals, {"normals": whole.height}, "normals", nothing, turn, figures)
@@ -208,6 +207,7 @@ def _with_parallax(
     stack: Stack,
     budget_s: float,
     start: Array | None,
+    bounded: bool,
     seed: int,
     progress: Progress | None,
 ) -> _Solved:
@@ -218,17 +218,18 @@ def _with_parallax(
     height = start
     if height is None:
         height = fitted_heights(
-            _as_btf(btf, stack), budget_s=budget_s, seed=seed, progress=progress
+            of_stack(btf, stack), budget_s=budget_s, seed=seed, progress=progress
         )
     before = disagreement(many, np.zeros_like(height))
     heights = {"model": height}
     found: tuple[Normals, Sweep, Fused] | None = None
-    for step in _SWEEPS:
-        found = _round(few, many, height, step, None if found is None else found[0], seed)
+    for step in SWEEPS:
+        before_it = None if found is None else found[0]
+        found = _round(few, many, height, step, before_it, bounded=bounded, seed=seed)
         height = found[2].height
     assert found is not None
     normals, swept, fused = found
-    alone = integrate(normals.slope, _weights(normals), wrap=stack.wrap).height
+    alone = integrate(normals.slope, slope_weights(normals), wrap=stack.wrap).height
     heights |= {"normals": alone + height.mean() - alone.mean(), "parallax": swept.height}
     heights["fusion"] = height
     figures = {
@@ -244,7 +245,14 @@ def _with_parallax(
 
 
 def _round(
-    few: Stack, many: Stack, height: Array, step: float, before: Normals | None, seed: int
+    few: Stack,
+    many: Stack,
+    height: Array,
+    step: float,
+    before: Normals | None,
+    *,
+    bounded: bool,
+    seed: int,
 ) -> tuple[Normals, Sweep, Fused]:
     """Normals, sweep and fusion around heights, with the relief's own visibility."""
     lit, looked = (visibility(height, d, wrap=few.wrap) for d in (few.lights, few.views))
@@ -253,7 +261,7 @@ def _round(
     swept = sweep(many, height, normals, step=step)
     fused = fuse(
         normals.slope, normals.variance[..., [0, 2]], swept.height, swept.variance,
-        wrap=few.wrap, bounds=shadow_bounds(few, height, normals), seed=seed,
+        wrap=few.wrap, bounds=shadow_bounds(few, height, normals) if bounded else None, seed=seed,
     )  # fmt: skip
     return normals, swept, fused
 
@@ -264,12 +272,7 @@ def _expected_error(fused: Fused, swept: Sweep) -> Array:
     return np.sqrt(np.square(fused.deviation) + systematic).astype(np.float32)
 
 
-def _weights(normals: Normals) -> Array:
-    by = 1 / (normals.variance[..., [0, 2]] + _SLOPE_ERROR**2)
-    return by.astype(np.float32)
-
-
-def _as_btf(btf: BTF, stack: Stack) -> BTF:
+def of_stack(btf: BTF, stack: Stack) -> BTF:
     """The pairs of a stack, which lie in memory already."""
     textures = as_textures(np.ascontiguousarray(stack.values.transpose(2, 0, 1, 3)))
     return replace(btf.subset(stack.pairs), textures=textures, validity=None, variance=None)

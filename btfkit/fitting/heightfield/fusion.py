@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 
 from btfkit.fitting.heightfield.bounds import Bounds
 from btfkit.relief.integration import System, softened, system_of
+from btfkit.relief.photometric import SLOPE_ERROR
 
 Array = NDArray[np.float32]
 Floats = NDArray[Any]
 
 _ROUNDS = 4
-# Systematic part of a slope's error: interpolation, reflectance that is no single lobe.
-_SLOPE_ERROR = 0.03
 # A height so many deviations off counts half.
 _HALF = 2.5
 # Deviation of a bound: shadows' edges are as soft as a footprint.
@@ -64,7 +63,7 @@ def fuse(
         wrap: whether the surface tiles. seed: of the deviation's samples.
         bounds: that shadows set; a height beyond one is drawn back to it.
     """
-    by_slope = 1 / (np.maximum(slope_variance, 0) + _SLOPE_ERROR**2)
+    by_slope = 1 / (np.maximum(slope_variance, 0) + SLOPE_ERROR**2)
     by_height = 1 / np.maximum(height_variance, 1e-6)
     base = system_of(slope, by_slope, wrap=wrap, known=height, by_known=by_height)
     now, found, steps = base, np.where(np.isfinite(height), height, 0).astype(float), 0

@@ -94,7 +94,7 @@ def reached(height: Array, towards: Array, *, wrap: bool) -> Array:
     return visibility(height, towards, wrap=wrap).mean(axis=0).astype(np.float32)
 
 
-def sweep(stack: Stack, height: Array, normals: Normals, *, step: float) -> Sweep:
+def sweep(stack: Stack, height: Array, normals: Normals | None, *, step: float) -> Sweep:
     """Heights at which the views' pictures of each light agree best, near given ones.
 
     Of each light, the values that views see of a point are taken as a multiple, its own for each
@@ -103,7 +103,8 @@ def sweep(stack: Stack, height: Array, normals: Normals, *, step: float) -> Swee
 
     Args:
         stack: of several views. height: (h, w) to begin with, texels.
-        normals: fitted there. step: between two looked at, texels.
+        normals: fitted there; None takes points to look the same from everywhere.
+        step: between two looked at, texels.
     """
     looks = np.array(_LOOKS) * step
     seen = visibility(height, stack.views, wrap=stack.wrap)

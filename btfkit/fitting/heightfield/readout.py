@@ -94,6 +94,7 @@ def read_out(
         "cpu_seconds": time.process_time() - cpu,
     }
     found = Found(
-        relief, normals, {"model": height}, nothing, seen, seen, maps, np.arange(0), figures
-    )
+        relief, normals, {"model": height}, nothing, table, table, seen, seen, maps,
+        np.arange(0), figures,
+    )  # fmt: skip
     return found, btf

@@ -1,0 +1,67 @@
+"""Each source of heights by itself, for comparison: light, parallax, and shadows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfkit.btf import BTF
+from btfkit.fitting.heightfield.bounds import shadow_bounds
+from btfkit.fitting.heightfield.fusion import fuse
+from btfkit.fitting.heightfield.parallax import fitted_heights, sweep
+from btfkit.relief.integration import Integrated, integrate
+from btfkit.relief.photometric import Normals, photometric_stereo, slope_weights
+from btfkit.relief.stack import Array, Stack, visibility
+
+# Rounds of normals with own visibility; steps of a sweep, texels: each round looks closer.
+_NORMAL_ROUNDS = 1
+SWEEPS = (1.0, 0.5, 0.25, 0.12)
+# Rounds in which shadows carve a plane: each moves a texel as far as its neighbours allow.
+_CARVINGS = 12
+
+
+def by_light(stack: Stack, first: Normals | None = None) -> tuple[Normals, Integrated]:
+    """Normals, and the surface of their slopes alone, with the relief's own shadows.
+
+    Args:
+        stack: many lights of a few views, each taken to see the plane.
+        first: normals found before, without shadows known; None finds them.
+    """
+    normals = photometric_stereo(stack) if first is None else first
+    for _ in range(_NORMAL_ROUNDS):
+        whole = integrate(normals.slope, slope_weights(normals), wrap=stack.wrap)
+        visible = visibility(whole.height, stack.lights, wrap=stack.wrap)[stack.light_of]
+        normals = photometric_stereo(stack, visible=visible, start=normals)
+    return normals, integrate(normals.slope, slope_weights(normals), wrap=stack.wrap)
+
+
+def by_parallax(btf: BTF, stack: Stack, *, budget_s: float, seed: int = 0) -> Array:
+    """(h, w) heights, texels: a fitted model's, then where views agree, whatever the surface faces.
+
+    Args:
+        btf: what the model is fitted to. stack: all views of a few lights. budget_s: of the model.
+    """
+    height = fitted_heights(btf, budget_s=budget_s, seed=seed)
+    unknown = np.zeros((*stack.size, 2), np.float32)
+    for step in SWEEPS:
+        swept = sweep(stack, height, None, step=step)
+        height = fuse(
+            unknown, np.full_like(unknown, np.inf), swept.height, swept.variance, wrap=stack.wrap
+        ).height
+    return height
+
+
+def by_shadows(stack: Stack) -> Array:
+    """(h, w) heights of mean 0, texels: a plane that shadows carve; they know no slopes.
+
+    Args:
+        stack: many lights of a few views, each taken to see the plane.
+    """
+    normals = photometric_stereo(stack)
+    height = np.zeros(stack.size, np.float32)
+    slope = np.zeros((*stack.size, 2), np.float32)
+    for _ in range(_CARVINGS):
+        bounds = shadow_bounds(stack, height, normals)
+        height = fuse(
+            slope, np.ones_like(slope), height, np.ones_like(height), wrap=stack.wrap, bounds=bounds
+        ).height
+    return height - height.mean()
