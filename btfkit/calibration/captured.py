@@ -110,6 +110,8 @@ def read(
         validity=_validity(textures) if lacks else None,
         variance=textures.variance(),
         footprint=footprint,
+        coverage=textures.coverage(),
+        blurs=textures.blurs(),
         channels=textures.channels,
         colour=COLOUR if rig.colour is not None else "the camera's own",
         texel_mm=grid.texel_mm,
