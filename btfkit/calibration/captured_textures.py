@@ -15,8 +15,8 @@ from btfkit.btf import RGB
 from btfkit.calibration.alignment import Aligned
 from btfkit.calibration.colours import ColourCorrection
 from btfkit.calibration.demosaic import sites
-from btfkit.calibration.geometry_stage import LAMP
 from btfkit.calibration.merge import Merged
+from btfkit.calibration.nominal import LAMP
 from btfkit.calibration.rectify import Footprints, Grid, Rectified, rectify
 from btfkit.calibration.rig import CalibratedRig
 from btfkit.calibration.windows import radiance_of
