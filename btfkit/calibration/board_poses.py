@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from btfkit.calibration import corners
 from btfkit.calibration.board import Board
 from btfkit.calibration.camera_model import Camera
 from btfkit.calibration.geometry_stage import grey
@@ -101,7 +102,7 @@ class Finder:
         )
         places: dict[int, list[Floats]] = {}
         for picture, own, _ in seen:
-            pixels, _ = board.refine(picture, own, self.camera, pose, blur_px=self.blur_px)
+            pixels, _ = corners.refine(board, picture, own, self.camera, pose, blur_px=self.blur_px)
             for number, pixel in zip(own.tolist(), pixels, strict=True):
                 if np.isfinite(pixel).all():
                     places.setdefault(number, []).append(pixel)

@@ -258,7 +258,8 @@ class _BlurMaps(Textures):
         if not self._of.placed(pair):
             return np.full(self.shape[1:], np.nan, np.float32)
         where = self._of.footprints(pair)
-        return np.where(np.isfinite(where.place).all(-1)[..., None], where.blur, np.nan)
+        shown = np.asarray(np.isfinite(where.place).all(-1))
+        return np.where(shown[..., None], where.blur, np.float32(np.nan))
 
     def crop(self, rows: slice, cols: slice) -> Textures:
         return _BlurMaps(self._of.cropped(rows, cols), self._pairs)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from btfkit.calibration import corners
 from btfkit.calibration.board import Board
 from btfkit.calibration.bundle import Adjustment, Sighting, SphereSighting, adjust
 from btfkit.calibration.geometry import Geometry
@@ -127,11 +128,11 @@ def _seen_again(
     found = []
     for picture, frame in zip(pictures, frames, strict=True):
         pose = rig.sample_to_camera(frame.axes) @ rig.board
-        pixels, sd = board.refine(picture, every, rig.camera, pose, blur_px=blur_px)
+        pixels, sd = corners.refine(board, picture, every, rig.camera, pose, blur_px=blur_px)
         good = np.isfinite(pixels).all(axis=1) & np.isfinite(sd).all(axis=1)
         if good.sum() >= _FEWEST_CORNERS:
-            corners = board.corners_mm[good]
-            found.append(Sighting(frame.file, frame.axes, corners, pixels[good], sd_px=sd[good]))
+            points = board.corners_mm[good]
+            found.append(Sighting(frame.file, frame.axes, points, pixels[good], sd_px=sd[good]))
     return found
 
 

@@ -149,7 +149,7 @@ def _expected_error_mm(geometry: Geometry, data: Mapping[str, Any]) -> float | N
     """Of places on the sample: what corners are off by, and axes from their readings."""
     if "corner" not in data["residuals_px"]:
         return None
-    readings = next(iter(data.get("readings", {}).values()), {})
+    readings: Mapping[str, float] = next(iter(data.get("readings", {}).values()), {})
     away = geometry.sample_to_camera(readings) if readings else geometry.camera_pose
     middle = float(away.translation[2]) / float(geometry.camera.parameters[0])
     corners = float(data["residuals_px"]["corner"]) * middle
