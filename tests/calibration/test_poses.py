@@ -11,6 +11,10 @@ from scipy.spatial.transform import Rotation
 
 import btfkit
 from btfkit import counts
+from btfkit.calibration.board import Board
+from btfkit.calibration.board_poses import Finder
+from btfkit.calibration.camera_model import Camera
+from btfkit.calibration.sensor_stage import fit_sensor
 from btfkit.calibration.stages import calibrate
 from btfkit.errors import CalibrationError
 from btfkit.sequence import Frame, Sequence, save
@@ -176,3 +180,20 @@ def test_a_board_in_view_tells_the_pose_of_every_frame(boards):
     assert data["residuals_px"]["corner"] < 0.03
     # What the table said of the views, and how far off that was.
     assert 0.4 < data["off_table_deg"]["worst"] < 1.2
+
+
+@pytest.mark.slow
+def test_frames_of_one_view_in_which_the_board_moved_are_named(boards):
+    sequence = Sequence.open(boards[0])
+    radiometry, _ = fit_sensor(sequence)
+    camera = Camera(turntables.WIDTH, turntables.HEIGHT, turntables.TRUTH)
+    board = Board.from_json(sequence.target["board"])
+    finder = Finder(sequence, radiometry, board, camera, 0.6, 0, [])
+    # Two frames of the first pose of the sample, then one of the second.
+    _, way, residual = finder.pose([(4,), (5,)])
+    assert way == "board"
+    assert residual < 0.03
+    with pytest.raises(
+        CalibrationError, match=r"004.png and others of its view show the board up to"
+    ):
+        finder.pose([(4,), (6,)])
