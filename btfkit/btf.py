@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from btfkit import directions, nearfield
+from btfkit.footprint import Blurs
 from btfkit.textures import Index, Textures, as_textures
 
 if TYPE_CHECKING:
@@ -37,6 +38,8 @@ class BTF:
         validity: (n, h, w) or (1, h, w) bool, False where a value must not be used.
         variance: (n, h, w, c) variance of the values, where known; any lazy array-like.
         footprint: (n,) standard deviation of each image's own blur, texels.
+        coverage: (n, h, w, 1) share of each texel's kernel that a frame showed, where known; any
+            lazy array-like. blurs: the blur of every texel, of which `footprint` is the mean.
         channels: one name a channel: R, G, B, or wavelengths in nm.
         colour: what the numbers of the channels mean.
         texel_mm: edge of a texel; None where unknown.
@@ -57,6 +60,8 @@ class BTF:
     validity: NDArray[np.bool_] | None = None
     variance: Any | None = None
     footprint: NDArray[np.float32] | None = None
+    coverage: Any | None = None
+    blurs: Blurs | None = None
     channels: tuple[str, ...] = RGB
     colour: str = COLOUR
     texel_mm: float | None = None
@@ -87,6 +92,14 @@ class BTF:
             raise ValueError(f"variance has shape {self.variance.shape}; expected {(n, h, w, c)}")
         if self.footprint is not None and self.footprint.shape != (n,):
             raise ValueError(f"footprint has shape {self.footprint.shape}; expected ({n},)")
+        if self.coverage is not None and tuple(self.coverage.shape) != (n, h, w, 1):
+            raise ValueError(f"coverage has shape {self.coverage.shape}; expected {(n, h, w, 1)}")
+        if self.blurs is not None:
+            blurred = (len(self.blurs.of), *self.blurs.maps.shape[1:3])
+            if blurred != (n, h, w):
+                raise ValueError(
+                    f"blurs are (pairs, rows, columns) {blurred}; expected {(n, h, w)}"
+                )
         if self.texel_mm is not None and not (np.isfinite(self.texel_mm) and self.texel_mm > 0):
             raise ValueError(f"texel_mm = {self.texel_mm}; expected a positive length")
         if self.wrap not in ("wrap", "clamp"):
@@ -167,6 +180,8 @@ class BTF:
             validity=self.validity if keep_validity else pick(self.validity),
             variance=None if self.variance is None else as_textures(self.variance).subset(index),
             footprint=pick(self.footprint),
+            coverage=None if self.coverage is None else as_textures(self.coverage).subset(index),
+            blurs=None if self.blurs is None else self.blurs.subset(index),
         )
 
     def select(self, *, lights: slice = slice(None), views: slice = slice(None)) -> BTF:
@@ -210,6 +225,8 @@ class BTF:
             textures=self.textures.crop(r, c),
             validity=None if self.validity is None else self.validity[:, r, c],
             variance=None if self.variance is None else as_textures(self.variance).crop(r, c),
+            coverage=None if self.coverage is None else as_textures(self.coverage).crop(r, c),
+            blurs=None if self.blurs is None else self.blurs.crop(r, c),
             wrap="clamp",
             **moved,
         )

@@ -7,8 +7,11 @@ import io
 import struct
 import tempfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +32,7 @@ _PHOTOMETRIC = {0: "grey of which 0 is white", 3: "a palette", 4: "a mask", 5: "
                 34892: "linear sensor values"}  # fmt: skip
 # Format and bits of a sample.
 _DEPTHS = {(1, 8), (1, 16), (3, 32)}
+_BAYER = ("RGGB", "BGGR", "GRBG", "GBRG")
 _CURVES = {291: "a grey response curve", 301: "a transfer function", 342: "a transfer range"}
 _PNG_KINDS = {0: "grey", 2: "RGB", 3: "a palette", 4: "grey with alpha", 6: "RGB with alpha"}
 
@@ -119,7 +123,67 @@ def _read_floats(name: str, data: bytes) -> Counts:
     return values[..., 0] if values.shape[2] == 1 else np.ascontiguousarray(values[..., :3])
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class RawFile:
+    """A RAW file: its mosaic, and what the camera says of it.
+
+    Attributes:
+        mosaic: (h, w) counts of the visible area. cfa: colours of its first 2 x 2 pixels.
+        black, white: levels of no light and of saturation, counts; black by colour (3,).
+        balance: (3,) what the camera multiplies its colours by for a white, green 1.
+        to_rgb: (3, 3) balanced colours of the camera to linear sRGB. from_xyz: (3, 3) CIE XYZ to
+            the camera's colours. Zeros where a matrix is not known.
+    """
+
+    mosaic: NDArray[np.uint16]
+    cfa: str
+    black: NDArray[np.float64]
+    white: float
+    balance: NDArray[np.float64]
+    to_rgb: NDArray[np.float64]
+    from_xyz: NDArray[np.float64]
+
+
+def read_raw(name: str, data: bytes) -> RawFile:
+    """A RAW file with its levels.
+
+    Raises:
+        FormatError: no RAW file, not of a mosaic of red, green and blue, or without rawpy.
+    """
+    with _opened(name, data) as raw:
+        if raw.raw_image_visible.ndim != 2 or raw.raw_colors_visible is None:
+            raise FormatError(name, "a RAW file without a mosaic", remedy="develop it elsewhere")
+        letters = raw.color_desc.decode("ascii", "replace")
+        tile = raw.raw_colors_visible[:2, :2].ravel().tolist()
+        cfa = "".join(letters[number] for number in tile)
+        colours = raw.raw_colors_visible[:16, :16]
+        tiled = np.tile(colours[:2, :2], (8, 8))[: colours.shape[0], : colours.shape[1]]
+        if cfa not in _BAYER or (colours != tiled).any():
+            raise FormatError(
+                name, f"a RAW file of the mosaic {cfa}; expected red, green and blue, 2 x 2",
+                remedy="develop it elsewhere to linear 16-bit TIFF, and say --transfer linear",
+            )  # fmt: skip
+        # Greens may be told apart; they are one colour.
+        order = [letters.index(letter) for letter in "RGB"]
+        given = np.array(raw.camera_whitebalance, float)[order]
+        good = np.isfinite(given).all() and (given > 0).all()
+        return RawFile(
+            np.array(raw.raw_image_visible, np.uint16), cfa,
+            np.array(raw.black_level_per_channel, float)[order], float(raw.white_level),
+            given / given[1] if good else np.ones(3),
+            np.array(raw.color_matrix, float)[:, order], np.array(raw.rgb_xyz_matrix, float)[order],
+        )  # fmt: skip
+
+
 def _read_raw(name: str, data: bytes) -> Counts:
+    with _opened(name, data) as raw:
+        return np.array(raw.raw_image_visible, np.uint16)
+
+
+@contextmanager
+def _opened(name: str, data: bytes) -> Iterator[Any]:
+    """A RAW file open in rawpy."""
     try:
         rawpy = importlib.import_module("rawpy")
     except ImportError as error:
@@ -128,7 +192,7 @@ def _read_raw(name: str, data: bytes) -> Counts:
         ) from error
     try:
         with rawpy.imread(io.BytesIO(data)) as raw:
-            return np.array(raw.raw_image_visible, np.uint16)
+            yield raw
     except rawpy.LibRawError as error:
         raise FormatError(name, f"not a readable RAW file ({error})") from error
 

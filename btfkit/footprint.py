@@ -9,12 +9,14 @@ below this module, hold the same logarithm.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from btfkit.textures import Array
+from btfkit.textures import Array, Index, as_textures
 
 # One texel: the footprint that needs no level and no blur.
 FINEST = 0.5
@@ -93,3 +95,42 @@ def _separable(image: Array, down: Array, across: Array) -> Array:
     part = (down @ image.reshape(h, -1)).reshape(-1, w, c)
     found: Array = np.matmul(across, part)
     return found
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Blurs:
+    """The blur of every texel of every view, which differs over a texture seen by a near camera.
+
+    Attributes:
+        maps: (m, h, w, 3) covariance of a texel's whole blur, texels squared: uu, uv, vv with u
+            along columns and v along rows; NaN where the view does not show it. Lazy.
+        of: (n,) which map each pair has; all lights of a view share one.
+
+    Raises:
+        ValueError: arrays that do not fit each other.
+    """
+
+    maps: Any
+    of: NDArray[np.integer]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "maps", as_textures(self.maps))
+        m, _, _, c = self.maps.shape
+        if c != 3 or self.of.ndim != 1 or self.of.size == 0:
+            raise ValueError(f"maps {self.maps.shape} of pairs {self.of.shape} are no blurs")
+        if self.of.min() < 0 or self.of.max() >= m:
+            raise ValueError(f"pairs have blurs {self.of.min()} to {self.of.max()}; there are {m}")
+
+    def of_pair(self, pair: int) -> Array:
+        """(h, w, 3) covariance of the blur of every texel of a pair."""
+        return np.asarray(self.maps[int(self.of[pair])])
+
+    def subset(self, pairs: Index) -> Blurs:
+        """Those of some pairs, without maps that none of them has."""
+        used, of = np.unique(self.of[pairs], return_inverse=True)
+        return Blurs(self.maps.subset(used.astype(np.intp)), of)
+
+    def crop(self, rows: slice, cols: slice) -> Blurs:
+        """Those of a window."""
+        return Blurs(self.maps.crop(rows, cols), self.of)

@@ -7,6 +7,7 @@ import importlib.metadata
 import os
 import platform
 import shutil
+import tempfile
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -16,6 +17,7 @@ from typing import Any, final
 from btfkit import io
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
+from btfkit.files import refuse_existing
 from btfkit.io import listing
 from btfkit.io.store import reader as store
 from btfkit.io.store import writer
@@ -105,6 +107,62 @@ def ingest(
         phase("reading and writing")
     writer.write(record, final, dtype=dtype, jobs=jobs, force=force, progress=progress)
     return checked(final, source, record.shape)
+
+
+def ingest_on_found_relief(
+    source: str | os.PathLike[str] | Remote,
+    out: str | os.PathLike[str] | Remote | None = None,
+    *,
+    options: Mapping[str, Any] | None = None,
+    part: Part | None = None,
+    seed: int = 0,
+    phase: Callable[[str], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **writing: Any,
+) -> tuple[Location, Path]:
+    """A sequence twice: the relief that the first store implies registers the views of the second.
+
+    Relief moves texels of tilted views against each other as a shift would; on the relief they are
+    compared without parallax.
+
+    Args:
+        source, out, part, writing: as `ingest`'s.
+        options: as `ingest`'s, without `relief`. seed: of the fit of the relief.
+        phase, progress: as `ingest`'s.
+
+    Returns:
+        The store, and the relief file beside it.
+
+    Raises:
+        BtfkitError: as `ingest` and `find_relief`; what is no sequence has no relief to find.
+    """
+    from btfkit.fitting.heightfield import find_relief
+    from btfkit.relief import file as relief_file
+
+    final = located(out) if out is not None else store_name(source)
+    force = bool(writing.get("force", False))
+    name = (writing.pop("format", None)) or io.detect(source)
+    if name != "sequence" or not isinstance(final, Path):
+        raise ValueError(
+            f"--relief auto: {source} is read as {name} into {final}; it takes a sequence "
+            "of frames and a store on this machine"
+        )
+    told = phase or (lambda part: None)
+    relief = refuse_existing(final.with_name(f"{final.name.removesuffix('.btf.zarr')}.relief.exr"),
+                             force=force)  # fmt: skip
+    given = dict(options or {})
+    place_of(final, force=force)
+    with tempfile.TemporaryDirectory(dir=final.absolute().parent, prefix=".first-") as folder:
+        first = Path(folder) / "first.btf.zarr"
+        ingest(source, first, format=name, options=given, part=part, phase=phase,
+               progress=progress, **{**writing, "force": False})  # fmt: skip
+        told("finding the relief")
+        btf = io.open(first)
+        found = find_relief(btf, seed=seed, progress=progress).relief
+        relief_file.write(found.of_three(), relief, unit="mm", force=force)
+    given |= {"relief": relief, "register": True}
+    return ingest(source, final, format=name, options=given, part=part, phase=phase,
+                  progress=progress, **writing), relief  # fmt: skip
 
 
 def recorded(

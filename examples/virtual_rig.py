@@ -32,6 +32,7 @@ def measure(here: Path, run: Run) -> None:
 
 def picture(here: Path) -> None:
     """The rig, a raw frame, the rectified texture, the truth and their difference, side by side."""
+    import numpy as np
     from matplotlib.figure import Figure
 
     import btfkit
@@ -41,11 +42,10 @@ def picture(here: Path) -> None:
     if (here / "rig.png").exists():
         return
     truth = btfkit.open(here / "rig-truth.btf.zarr")
-    # The store keeps the mean of a blur alone, the sequence all of it.
-    captured = btfkit.open(here / "rig", texel_mm=TEXEL_MM)
+    captured = btfkit.open(here / "rig.btf.zarr")
     pair = int(captured.view[:, 2].argsort()[len(captured) // 2])
-    found = btfkit.open(here / "rig.btf.zarr").texture(pair)
-    blur = captured.textures.footprints(pair).blur.mean((0, 1))
+    found = captured.texture(pair)
+    blur = np.nanmean(captured.blurs.of_pair(pair), (0, 1))
     wanted = blurred(truth.texture(pair), blur)
     white = 1.2 * wanted.max()
     figure = Figure(figsize=(17, 4), layout="constrained")

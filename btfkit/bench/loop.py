@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit import io
-from btfkit.calibration.captured_textures import CapturedTextures
 from btfkit.devices.twin.truth import blurred, truth
 
 Floats = NDArray[np.float64]
@@ -56,14 +55,13 @@ def compare(run: Path) -> Looped:
     if true.texel_mm is None:
         raise ValueError(f"{run}: the truth has no size")
     btf = io.open(run, texel_mm=2 * true.texel_mm)
-    textures = btf.textures
-    if not isinstance(textures, CapturedTextures):
+    if btf.blurs is None:
         raise TypeError(f"{run} is no sequence")
     inner = slice(_RIM, -_RIM), slice(_RIM, -_RIM)
     rows = []
     for pair in range(len(btf)):
         found = btf.texture(pair)[inner]
-        blur = np.nanmean(textures.footprints(pair).blur, (0, 1))
+        blur = np.nanmean(btf.blurs.of_pair(pair), (0, 1))
         wanted = blurred(true.texture(pair), blur)[inner]
         seen = np.isfinite(found)
         off = np.log1p(np.maximum(found, -0.5)) - np.log1p(wanted)

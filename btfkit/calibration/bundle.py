@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.optimize import least_squares
 
-from btfkit.calibration.bundle_problem import Problem, Sighting, SphereSighting
+from btfkit.calibration.bundle_problem import Problem
 from btfkit.calibration.geometry import Geometry
+from btfkit.calibration.sightings import Sighting, SphereSighting
 from btfkit.errors import CalibrationError
 
 Floats = NDArray[np.float64]
@@ -105,9 +106,9 @@ def adjust(
             remedy="take more target frames",
         )
     problem = Problem(start, sightings, spheres, slip_sd=slip_sd or {})
-    x = np.zeros(problem.size)
+    x = np.zeros(problem.parameters.size)
     use = np.ones(problem.count, bool)
-    free = _observed(problem, x, use, np.ones(problem.size, bool))
+    free = _observed(problem, x, use, np.ones(problem.parameters.size, bool))
     for turn in range(_ROUNDS):
         x = _minimum(problem, x, use, free, robust=turn == 0)
         residual, _ = problem.evaluate(x)
@@ -132,7 +133,7 @@ def _minimum(
 
     def full(part: Floats) -> Floats:
         whole = x.copy()
-        whole[columns] = part * problem.scale[columns]
+        whole[columns] = part * problem.parameters.scale[columns]
         return whole
 
     def residual(part: Floats) -> Floats:
@@ -140,14 +141,14 @@ def _minimum(
 
     def slopes(part: Floats) -> Any:
         jacobian = problem.evaluate(full(part))[1][rows][:, columns].multiply(
-            problem.scale[columns]
+            problem.parameters.scale[columns]
         )
         # Few columns are solved exactly; many, mostly of slips, sparsely.
         return jacobian.toarray() if len(columns) <= 600 else jacobian.tocsr()
 
     solved = least_squares(
         residual,
-        x[columns] / problem.scale[columns],
+        x[columns] / problem.parameters.scale[columns],
         jac=slopes,
         loss="huber" if robust else "linear",
         f_scale=_HUBER,
@@ -170,14 +171,14 @@ def _observed(
     columns = np.flatnonzero(free)
     _, jacobian = problem.evaluate(x)
     told = np.flatnonzero(use[: problem.told])
-    scaled = (jacobian[told][:, columns].multiply(problem.scale[columns])).toarray()
+    scaled = (jacobian[told][:, columns].multiply(problem.parameters.scale[columns])).toarray()
     _, values, across = np.linalg.svd(scaled, full_matrices=len(scaled) < len(columns))
     sizes = np.zeros(len(columns))
     sizes[: len(values)] = values
     flat = across[sizes < 1 / _OBSERVED]
     if len(flat) == 0:
         return free
-    weighted = flat * problem.give_up[columns]
+    weighted = flat * problem.parameters.give_up[columns]
     _, _, order = linalg.qr(weighted, mode="economic", pivoting=True)
     still = free.copy()
     still[columns[order[: len(flat)]]] = False
@@ -219,7 +220,7 @@ def _outcome(
 ) -> Adjustment:
     residual, jacobian = problem.evaluate(x)
     rows, columns = np.flatnonzero(use), np.flatnonzero(free)
-    scale = problem.scale[columns]
+    scale = problem.parameters.scale[columns]
     scaled = jacobian[rows][:, columns].multiply(scale).toarray()
     values = np.linalg.svd(scaled, compute_uv=False)
     condition = float(values[0] / values[-1])
@@ -238,16 +239,16 @@ def _outcome(
     spread = (across.T / values) * scale[:, None]
     told = free.copy()
     return Adjustment(
-        geometry=problem.geometry(x),
-        names=tuple(problem.names[i] for i in columns),
+        geometry=problem.parameters.geometry(x),
+        names=tuple(problem.parameters.names[i] for i in columns),
         covariance=spread @ spread.T,
         condition=condition,
-        held=tuple(problem.names[i] for i in np.flatnonzero(~told)),
+        held=tuple(problem.parameters.names[i] for i in np.flatnonzero(~told)),
         rms=rms,
         view_rms=problem.by_sighting(
             np.where(use, residual, np.nan),
             lambda e: np.sqrt(np.nanmean(e**2)) if np.isfinite(e).any() else np.inf,
         ),
         rejected=int((~use).sum()),
-        slips=problem.slips(x),
+        slips=problem.parameters.slips(x),
     )

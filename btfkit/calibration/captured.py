@@ -13,8 +13,9 @@ from btfkit.btf import BTF, COLOUR
 from btfkit.calibration.alignment import Aligned, align, report
 from btfkit.calibration.calibration import NAME, Calibration
 from btfkit.calibration.captured_textures import CapturedTextures
-from btfkit.calibration.geometry_stage import LAMP
+from btfkit.calibration.nominal import LAMP
 from btfkit.calibration.partial import lacking
+from btfkit.calibration.poses import with_poses
 from btfkit.calibration.rectify import Grid
 from btfkit.calibration.rig import CalibratedRig, grid_of, mean_footprint
 from btfkit.calibration.stages import calibrate, refuse_unfit
@@ -77,6 +78,7 @@ def read(
     if calibration is not None and previous is not None:
         refuse_unfit(sequence, previous, calibration)
     found, ran = calibrate(sequence, previous)
+    sequence = with_poses(sequence, found)
     rig = CalibratedRig.of(sequence, found)
     groups = list(sequence.groups("sample").values())
     grid = grid_of(sequence, rig, groups, texel_mm)
@@ -105,11 +107,13 @@ def read(
         textures=textures,
         light=directions.normalize(light).astype(np.float32),
         view=directions.normalize(view).astype(np.float32),
-        light_position=light,
+        light_position=None if rig.far_light else light,
         view_position=view,
         validity=_validity(textures) if lacks else None,
         variance=textures.variance(),
         footprint=footprint,
+        coverage=textures.coverage(),
+        blurs=textures.blurs(),
         channels=textures.channels,
         colour=COLOUR if rig.colour is not None else "the camera's own",
         texel_mm=grid.texel_mm,

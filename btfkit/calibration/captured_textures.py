@@ -15,18 +15,19 @@ from btfkit.btf import RGB
 from btfkit.calibration.alignment import Aligned
 from btfkit.calibration.colours import ColourCorrection
 from btfkit.calibration.demosaic import sites
-from btfkit.calibration.geometry_stage import LAMP
 from btfkit.calibration.merge import Merged
+from btfkit.calibration.nominal import LAMP
 from btfkit.calibration.rectify import Footprints, Grid, Rectified, rectify
 from btfkit.calibration.rig import CalibratedRig
 from btfkit.calibration.windows import radiance_of
 from btfkit.errors import CalibrationError
+from btfkit.footprint import Blurs
 from btfkit.sequence import Sequence
 from btfkit.textures import Textures
 
 Array = NDArray[np.float32]
-# Views whose footprints are kept at hand, and variances that wait to be asked for.
-_VIEWS, _WAITING = 8, 192
+# Views whose footprints are kept at hand, and textures whose other maps wait to be asked for.
+_VIEWS, _WAITING = 8, 32
 
 
 @final
@@ -59,7 +60,7 @@ class CapturedTextures(Textures):
     def _shaped(self) -> None:
         self.shape = (len(self._groups), self.grid.h, self.grid.w, len(self.channels))
         self._views: OrderedDict[tuple[Any, ...], Footprints] = OrderedDict()
-        self._waiting: OrderedDict[int, Array] = OrderedDict()
+        self._waiting: OrderedDict[int, dict[str, Array]] = OrderedDict()
         self._lock = threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -98,9 +99,24 @@ class CapturedTextures(Textures):
         """Whether a texture has a frame."""
         return bool(self._groups[index])
 
+    def placed(self, index: int) -> bool:
+        """Whether it is known from where a texture was seen."""
+        return bool(self._poses[index]) or self.seen(index)
+
     def variance(self) -> Textures:
         """The variances of these textures, each at hand after its texture was asked for."""
-        return _Variances(self)
+        return _Beside(self, "variance")
+
+    def coverage(self) -> Textures:
+        """(n, h, w, 1) seen share of each footprint, at hand after the texture was asked for."""
+        return _Beside(self, "coverage")
+
+    def blurs(self) -> Blurs:
+        """The blur of every texel, a map a view."""
+        views: dict[tuple[float, ...], int] = {}
+        of = [views.setdefault(self._view(k), len(views)) for k in range(len(self))]
+        first = [of.index(view) for view in range(len(views))]
+        return Blurs(_BlurMaps(self, first), np.array(of, np.intp))
 
     def brightness(self, index: int) -> Array:
         """(h, w) mean of the channels."""
@@ -138,21 +154,21 @@ class CapturedTextures(Textures):
 
     def _read(self, index: int) -> Array:
         found = self.rectified(index)
-        if found.variance is not None:
-            with self._lock:
-                self._waiting[index] = found.variance
-                while len(self._waiting) > _WAITING:
-                    self._waiting.popitem(last=False)
+        beside = _beside(found)
+        with self._lock:
+            self._waiting[index] = beside
+            while len(self._waiting) > _WAITING:
+                self._waiting.popitem(last=False)
         return found.value
 
-    def take_variance(self, index: int) -> Array:
-        """(h, w, c) variance of a texture; made anew where the texture was not just asked for."""
+    def take(self, name: str, index: int) -> Array:
+        """(h, w, ...) variance or coverage; made anew where the texture was not just asked for."""
         with self._lock:
-            waiting = self._waiting.pop(index, None)
+            waiting = self._waiting.get(index, {}).pop(name, None)
         if waiting is None:
-            waiting = self.rectified(index).variance
+            waiting = _beside(self.rectified(index)).get(name)
         if waiting is None:
-            raise CalibrationError("the sensor's noise is not known, and so no variance")
+            raise CalibrationError(f"the sensor's noise is not known, and so no {name}")
         return waiting
 
     def _frame_size(self, group: tuple[int, ...]) -> tuple[int, int]:
@@ -164,10 +180,8 @@ class CapturedTextures(Textures):
 
     def footprints(self, index: int) -> Footprints:
         """Where the texels of a texture lie in its frames; all lights of a view share them."""
+        key = self._view(index)
         readings = self._poses[index]
-        chains = self.rig.geometry.kinematics.chains
-        moved = (*chains.get("sample", ()), *chains.get("camera", ()))
-        key = (*(readings[name] for name in moved), *self._offsets_mm[index].tolist())
         with self._lock:
             known = self._views.get(key)
         if known is None:
@@ -180,6 +194,15 @@ class CapturedTextures(Textures):
                 while len(self._views) > _VIEWS:
                     self._views.popitem(last=False)
         return known
+
+    def _view(self, index: int) -> tuple[float, ...]:
+        """What tells a texture's view from others; empty of one that was not seen."""
+        if not self.placed(index):
+            return ()
+        readings = self._poses[index]
+        chains = self.rig.geometry.kinematics.chains
+        moved = (*chains.get("sample", ()), *chains.get("camera", ()))
+        return (*(readings[name] for name in moved), *self._offsets_mm[index].tolist())
 
     def _merged(self, group: tuple[int, ...], window: tuple[slice, slice]) -> Merged | None:
         """Merged exposures of the window, without stray light."""
@@ -208,21 +231,44 @@ class CapturedTextures(Textures):
 
 
 @final
-class _Variances(Textures):
-    """Variances of captured textures."""
+class _Beside(Textures):
+    """What comes with captured textures: their variances, or how much of each texel was seen."""
 
-    def __init__(self, of: CapturedTextures) -> None:
-        self._of = of
-        self.shape = of.shape
+    def __init__(self, of: CapturedTextures, name: str) -> None:
+        self._of, self._name = of, name
+        self.shape = of.shape if name == "variance" else (*of.shape[:3], 1)
 
     def _read(self, index: int) -> Array:
-        return self._of.take_variance(index)
+        return self._of.take(self._name, index)
 
     def crop(self, rows: slice, cols: slice) -> Textures:
-        cropped = self._of.crop(rows, cols)
-        if not isinstance(cropped, CapturedTextures):
-            raise TypeError("a window of captured textures is none")
-        return _Variances(cropped)
+        return _Beside(self._of.cropped(rows, cols), self._name)
+
+
+@final
+class _BlurMaps(Textures):
+    """The blur of every texel of some of the captured textures."""
+
+    def __init__(self, of: CapturedTextures, pairs: list[int]) -> None:
+        self._of, self._pairs = of, pairs
+        self.shape = (len(pairs), *of.shape[1:3], 3)
+
+    def _read(self, index: int) -> Array:
+        pair = self._pairs[index]
+        if not self._of.placed(pair):
+            return np.full(self.shape[1:], np.nan, np.float32)
+        where = self._of.footprints(pair)
+        shown = np.asarray(np.isfinite(where.place).all(-1))
+        return np.where(shown[..., None], where.blur, np.float32(np.nan))
+
+    def crop(self, rows: slice, cols: slice) -> Textures:
+        return _BlurMaps(self._of.cropped(rows, cols), self._pairs)
+
+
+def _beside(found: Rectified) -> dict[str, Array]:
+    """What comes with a texture, as the lists of it give it."""
+    out = {"coverage": found.coverage.astype(np.float32)[..., None]}
+    return out if found.variance is None else {**out, "variance": found.variance}
 
 
 def _corrected(

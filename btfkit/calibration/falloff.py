@@ -90,15 +90,50 @@ def correct(
             picture = photographs.colours(path, transfer)
             if picture.shape[:2] != size:
                 raise CalibrationError(f"{path}: another size than the spheres' photographs")
-            # Where the picture is cut off there is no value.
-            values = np.where(picture >= _SATURATED, np.nan, picture / shade[..., None])
-            name = f"{path.stem}.exr"
-            channels = "RGB" if picture.shape[2] == 3 else "Y"
-            images.write_exr(folder / name, values.astype(np.float16), tuple(channels))
+            name = _written(folder, path, picture, shade[..., None])
             ranges.append(float(shade.max() / shade.min()))
             names.append(out / name)
             progress(i + 1, len(table.files))
     return Falloff(way, np.array(residual), np.array(ranges)), tuple(names)
+
+
+def develop(
+    table: LightTable,
+    out: Path,
+    *,
+    force: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> tuple[Path, ...]:
+    """Write RAW photographs as half-float EXR in linear BT.709; fall-off stays in.
+
+    Args:
+        table: lights of the photographs. out: folder to write.
+        force: whether `out` is replaced. progress: called with what is done, and of how much.
+
+    Returns:
+        (n,) the files written.
+    """
+    names = []
+    with whole_folder(out, force=force) as folder:
+        for i, path in enumerate(table.files):
+            names.append(out / f"{path.stem}.exr")
+            if table.lights[i] is not None:
+                _written(folder, path, photographs.colours(path, "linear"), np.float32(1))
+            progress(i + 1, len(table.files))
+    return tuple(names)
+
+
+def _written(folder: Path, path: Path, picture: Array, divisor: Any) -> str:
+    """Write a photograph over what it is to be divided by; its name."""
+    # Where the picture is cut off there is no value.
+    values = np.where(picture >= _SATURATED, np.nan, picture / divisor)
+    matrix = photographs.colour_matrix(path)
+    if matrix is not None:
+        values = values @ matrix.T.astype(np.float32)
+    name = f"{path.stem}.exr"
+    channels = "RGB" if picture.shape[2] == 3 else "Y"
+    images.write_exr(folder / name, values.astype(np.float16), tuple(channels))
+    return name
 
 
 def _each(

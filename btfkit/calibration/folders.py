@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from btfkit import documents
-from btfkit.calibration import falloff, plots, report, rti, stages
+from btfkit.calibration import falloff, photographs, plots, report, rti, stages
 from btfkit.calibration.calibration import NAME, Calibration
 from btfkit.calibration.sensor_stage import NOISELESS_GAIN
 from btfkit.errors import CalibrationError
@@ -125,6 +125,9 @@ def calibrate_photographs(
             table, how.white, even, transfer=how.transfer, force=force, progress=progress
         )
         record["falloff"] = found.record()
+    elif any(map(photographs.is_raw, table.files)):
+        even = final.with_name(f"{final.stem}.developed")
+        files = falloff.develop(table, even, force=force, progress=progress)
     table.write_lp(final, files=files, force=force)
     beside = final.with_suffix(".json")
     documents.save(beside, stages.finite(record), force=True)
@@ -139,7 +142,7 @@ def calibrate_photographs(
         "out": final, "report": page, "data": beside, "corrected": even,
         "lights": record["lights"], "positions": record["positions"], "spheres": len(table.spheres),
         "error_deg": table.error_deg, "unit": table.unit, "without_light": record["without_light"],
-        "falloff_rms": record["falloff"]["rms"] if even is not None else None,
+        "falloff_rms": record["falloff"]["rms"] if "falloff" in record else None,
         **(_preview(final, lights) if preview and not within else {}),
     }  # fmt: skip
 

@@ -10,22 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from btfkit.calibration import corners
 from btfkit.calibration.board import Board
 from btfkit.calibration.bundle import Adjustment, Sighting, SphereSighting, adjust
-from btfkit.calibration.camera_model import Camera
 from btfkit.calibration.geometry import Geometry
 from btfkit.calibration.intrinsics import SingleCamera, calibrate_camera
-from btfkit.calibration.kinematics import Axis, Kinematics, Rigid
 from btfkit.calibration.merge import SATURATED
 from btfkit.calibration.mirrors import highlight
+from btfkit.calibration.nominal import LAMP, nominal, section_of
 from btfkit.calibration.radiometry import Radiometry
-from btfkit.errors import CalibrationError
 from btfkit.sequence import Frame, Sequence
 
 Floats = NDArray[np.float64]
-# The rig's own lamp, as the sequence has one.
-LAMP = "lamp"
-_DOCUMENT = "sequence.json"
 # Of the brightest pixel: what belongs to a highlight.
 _HIGHLIGHT = 0.3
 # Highlights are looked for within this share of a sphere's radius of where they should be.
@@ -72,10 +68,10 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
         CalibrationError: a rig or board that is not described, or frames that do not show it.
     """
     start = nominal(sequence)
-    board = Board.from_json(_section(sequence.target, "board", "target"))
+    board = Board.from_json(section_of(sequence.target, "board", "target"))
     groups = list(sequence.groups("target").values())
     frames = [sequence.frames[group[0]] for group in groups]
-    pictures = [_grey(radiometry, sequence, group)[0] for group in groups]
+    pictures = [grey(radiometry, sequence, group)[0] for group in groups]
     single = calibrate_camera(pictures, board)
     sightings, first = [], None
     for frame, view in zip(frames, single.views, strict=True):
@@ -102,7 +98,7 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
         sighting
         for group in sequence.groups("sphere").values()
         for sighting in find_highlights(
-            *_grey(radiometry, sequence, group), rough, sequence.frames[group[0]]
+            *grey(radiometry, sequence, group), rough, sequence.frames[group[0]]
         )
     ]
     found = adjust(rough, sightings, spheres, slip_sd=slip_sd) if spheres else first_fit
@@ -132,50 +128,12 @@ def _seen_again(
     found = []
     for picture, frame in zip(pictures, frames, strict=True):
         pose = rig.sample_to_camera(frame.axes) @ rig.board
-        pixels, sd = board.refine(picture, every, rig.camera, pose, blur_px=blur_px)
+        pixels, sd = corners.refine(board, picture, every, rig.camera, pose, blur_px=blur_px)
         good = np.isfinite(pixels).all(axis=1) & np.isfinite(sd).all(axis=1)
         if good.sum() >= _FEWEST_CORNERS:
-            corners = board.corners_mm[good]
-            found.append(Sighting(frame.file, frame.axes, corners, pixels[good], sd_px=sd[good]))
+            points = board.corners_mm[good]
+            found.append(Sighting(frame.file, frame.axes, points, pixels[good], sd_px=sd[good]))
     return found
-
-
-def nominal(sequence: Sequence) -> Geometry:
-    """The geometry that sequence.json states.
-
-    Raises:
-        CalibrationError: it lacks what a geometry needs, or garbles it.
-    """
-    rig, sensor = sequence.rig, sequence.sensor
-    try:
-        axes = [
-            Axis(str(a["name"]), str(a.get("kind", "rotary")), _vector(a["direction"]),
-                 _vector(a.get("point_mm", (0, 0, 0))))
-            for a in rig["axes"]
-        ]  # fmt: skip
-        carries = {
-            body: tuple(rig["carries"].get(body, ())) for body in ("sample", "camera", "light")
-        }
-        camera, lamp = rig["camera"], rig.get("light", {})
-        turn, eye = np.array(camera["rotation"], float), _vector(camera["position_mm"])
-        focal, centre = (np.array(camera[key], float) for key in ("focal_px", "centre_px"))
-        lens = np.concatenate([focal, centre, np.zeros(5)])
-        lights = {LAMP: _vector(lamp["position_mm"])} if "position_mm" in lamp else {}
-        spheres = sequence.target.get("spheres", [])
-        centres = np.array([_vector(s["centre_mm"]) for s in spheres]).reshape(-1, 3)
-        radii = np.array([float(s["radius_mm"]) for s in spheres])
-        if turn.shape != (3, 3) or lens.shape != (9,):
-            raise ValueError(f"camera of shapes {turn.shape} and {focal.shape}")
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise CalibrationError(
-            f"rig of {_DOCUMENT} does not tell axes, camera and light ({error!r})",
-            remedy="add axes, carries, camera (position_mm, rotation, focal_px, centre_px), light",
-        ) from error
-    return Geometry(
-        Camera(int(sensor.need("width")), int(sensor.need("height")), lens),
-        Rigid(turn, -turn @ eye), Kinematics(tuple(axes), carries),
-        _board_pose(sequence), centres, radii, lights,
-    )  # fmt: skip
 
 
 def find_highlights(
@@ -232,7 +190,7 @@ def _spot(bright: Floats, expected: Floats, reach: float) -> Floats | None:
     return np.array([low[0] + column, low[1] + row])
 
 
-def _grey(
+def grey(
     radiometry: Radiometry, sequence: Sequence, group: tuple[int, ...]
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """(h, w) radiance of an achromatic target, the colours of a mosaic brought to one scale.
@@ -250,44 +208,3 @@ def _grey(
     for c in range(3):
         out[colours == c] /= max(float(np.nanpercentile(radiance[colours == c], 90)), 1e-12)
     return out, saturated
-
-
-def _board_pose(sequence: Sequence) -> Rigid:
-    """Board to sample, from origin_mm (first outer corner) and drawn axes x and y (down)."""
-    if "board" not in sequence.target:
-        return Rigid.identity()
-    board = _section(sequence.target, "board", "target")
-    size = Board.from_json(board)
-    try:
-        across = _vector(board.get("x", (1, 0, 0)))
-        down = _vector(board.get("y", (0, -1, 0)))
-        width, height = (n * size.square_mm for n in size.squares)
-        rotation = np.stack([across, -down, np.cross(across, -down)], axis=1)
-        corner = board.get("origin_mm")
-        middle = (
-            np.zeros(3)
-            if corner is None
-            else _vector(corner) + across * width / 2 + down * height / 2
-        )
-    except (TypeError, ValueError) as error:
-        raise CalibrationError(f"target.board of {_DOCUMENT} has no pose ({error})") from error
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
-        raise CalibrationError(
-            f"target.board of {_DOCUMENT}: x {across.tolist()} and y {down.tolist()} are not "
-            "perpendicular unit vectors"
-        )
-    return Rigid(rotation, middle)
-
-
-def _section(of: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
-    section = of.get(name)
-    if not isinstance(section, Mapping):
-        raise CalibrationError(f"{_DOCUMENT} has no {where}.{name}", remedy="describe it there")
-    return section
-
-
-def _vector(values: Any) -> Floats:
-    vector = np.array(values, float)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ValueError(f"{values!r} is no vector of three numbers")
-    return vector

@@ -13,6 +13,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.calibration import corners
 from btfkit.calibration.board import Board
 from btfkit.calibration.camera_model import PARAMETERS, Camera
 from btfkit.calibration.kinematics import Rigid
@@ -103,7 +104,8 @@ def calibrate_camera(
     if blur_px is None:
         squarest = np.argsort([-abs(view.pose.rotation[2, 2]) for view in views])[:_BLUR_VIEWS]
         blurs = [
-            board.blur(images[usable[v]], views[v].numbers, camera, views[v].pose) for v in squarest
+            corners.blur_of(board, images[usable[v]], views[v].numbers, camera, views[v].pose)
+            for v in squarest
         ]
         blur_px = float(np.median(blurs))
     every = np.arange(len(board.corners_mm))
@@ -137,7 +139,7 @@ def _refined(
     blur_px: float,
 ) -> View:
     """The view with corners fitted to the frame, those of `numbers` that it shows."""
-    pixels, _ = board.refine(image, numbers, camera, view.pose, blur_px=blur_px)
+    pixels, _ = corners.refine(board, image, numbers, camera, view.pose, blur_px=blur_px)
     good = np.isfinite(pixels).all(axis=1)
     if good.sum() < 4:
         return view

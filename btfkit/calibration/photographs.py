@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit import counts
+from btfkit.calibration import raw
 from btfkit.errors import CalibrationError
 from btfkit.io import images
 
@@ -21,24 +22,20 @@ Progress = Callable[[float, float], None]
 def listed(path: Path) -> list[Path]:
     """Photographs of a folder in natural order (2 before 10), or the file itself.
 
+    RAW files count where there are no others: beside them lie the camera's own JPEGs.
+
     Raises:
-        CalibrationError: none, or RAW files.
+        CalibrationError: none.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path} is not there")
     members = [path] if path.is_file() else sorted(path.iterdir(), key=natural)
     shown = [p for p in members if not p.name.startswith("._")]
     found = [p for p in shown if p.is_file() and images.is_image(p.name)]
-    raw = [p for p in shown if p.suffix.lower() in counts.RAW]
-    if not found and raw:
-        raise CalibrationError(
-            f"{path}: {len(raw)} RAW files and no photographs",
-            remedy="develop them to linear 16-bit TIFF without sharpening, and say "
-            "--transfer linear",
-        )
+    found = found or [p for p in shown if p.is_file() and is_raw(p)]
     if not found:
         raise CalibrationError(
-            f"{path}: no photographs; expected {', '.join(sorted(images.SUFFIXES))}",
+            f"{path}: no photographs; expected {', '.join(sorted(images.SUFFIXES))} or RAW files",
             remedy="name the folder that holds them",
         )
     return found
@@ -50,9 +47,23 @@ def natural(path: Path) -> list[Any]:
     return [(1, int(p)) if p.isascii() and p.isdigit() else (0, p) for p in parts]
 
 
+def is_raw(path: Path) -> bool:
+    """Whether a name is that of a RAW file."""
+    return path.suffix.lower() in counts.RAW
+
+
 def colours(path: Path, transfer: str) -> Array:
-    """(h, w, c) linear."""
+    """(h, w, c) linear, 1 where a colour saturates; of a RAW file the camera's own colours."""
+    if is_raw(path):
+        return raw.developed(counts.read_raw(str(path), path.read_bytes()))
     return images.read(str(path), path.read_bytes(), transfer=transfer)
+
+
+def colour_matrix(path: Path) -> NDArray[np.float64] | None:
+    """(3, 3) from `colours` of a RAW file to linear BT.709; None where they are as they stay."""
+    if not is_raw(path):
+        return None
+    return raw.to_bt709(counts.read_raw(str(path), path.read_bytes()))
 
 
 def grey(path: Path, transfer: str, shape: tuple[int, int] | None = None) -> Array:

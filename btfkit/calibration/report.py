@@ -192,8 +192,17 @@ def _geometry(data: Mapping[str, Any]) -> str:
     ]
     rows += [
         ("Observations left out", str(data["rejected"])),
-        ("Condition", f"{data['condition']:.3g}"),
     ]
+    if "condition" in data:
+        rows.append(("Condition", f"{data['condition']:.3g}"))
+    if "poses_from" in data:
+        told = ", ".join(f"{way} of {n} views" for way, n in data["poses_from"].items())
+        rows.append(("Poses of single frames, there being no axes, from", told))
+    if data.get("off_table_deg"):
+        off = data["off_table_deg"]
+        rows.append(
+            ("Views beside those of the table", f"{off['rms']:.2f}° rms, {off['worst']:.2f}° worst")
+        )
     if data["held"]:
         rows.append(("Held, since the frames do not tell them", ", ".join(data["held"])))
     views = data["view_rms_px"]

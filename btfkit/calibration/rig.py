@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from btfkit.calibration.calibration import Calibration
 from btfkit.calibration.colours import ColourCorrection
 from btfkit.calibration.geometry import Geometry
-from btfkit.calibration.geometry_stage import nominal
+from btfkit.calibration.nominal import nominal
+from btfkit.calibration.poses import without_axes
 from btfkit.calibration.radiometry import Radiometry
 from btfkit.calibration.rectify import Footprints, Grid, footprints
 from btfkit.calibration.stages import colour_of, factors_of, geometry_of, scale_of, stray_of
@@ -39,6 +40,7 @@ class CalibratedRig:
         distance_mm: of the lamp to the white reference; None where values stay relative.
         scale: (c,) counts a second that a value of 1 gives at that distance.
         assumed: what the sequence did not tell.
+        far_light: whether of lights only directions are known.
     """
 
     geometry: Geometry
@@ -51,17 +53,25 @@ class CalibratedRig:
     distance_mm: float | None
     colour: ColourCorrection | None
     assumed: Mapping[str, str]
+    far_light: bool = False
 
     @staticmethod
     def of(sequence: Sequence, found: Calibration) -> CalibratedRig:
         assumed = {}
-        blur = 0.0
+        far, blur = False, 0.0
         error: float | None = None
         if "geometry" in found.sections:
             geometry = geometry_of(found)
             data = found.section("geometry").data
             blur = float(data["blur_px"])
+            far = bool(data.get("far_light", False))
             error = _expected_error_mm(geometry, data)
+        elif without_axes(sequence):
+            raise CalibrationError(
+                f"{sequence.path}: {found.missing.get('geometry')}",
+                remedy="describe rig.axes and carries, or tell light and camera of each frame: "
+                "docs/capture.md, the sequence folder",
+            )
         else:
             geometry = nominal(sequence)
             assumed["geometry"] = f"as sequence.json states it: {found.missing.get('geometry')}"
@@ -76,6 +86,7 @@ class CalibratedRig:
         return CalibratedRig(
             geometry, blur, error, Radiometry.from_section(found.section("radiometry")),
             factors_of(sequence, found), stray_of(found), scale, distance, colour, assumed,
+            far,
         )  # fmt: skip
 
     @property
@@ -135,9 +146,13 @@ def mean_footprint(rig: CalibratedRig, readings: Mapping[str, float], grid: Grid
     return float(np.sqrt(np.mean(seen))) if seen else float("inf")
 
 
-def _expected_error_mm(geometry: Geometry, data: Mapping[str, Any]) -> float:
+def _expected_error_mm(geometry: Geometry, data: Mapping[str, Any]) -> float | None:
     """Of places on the sample: what corners are off by, and axes from their readings."""
-    middle = float(geometry.camera_pose.translation[2]) / float(geometry.camera.parameters[0])
+    if "corner" not in data["residuals_px"]:
+        return None
+    readings: Mapping[str, float] = next(iter(data.get("readings", {}).values()), {})
+    away = geometry.sample_to_camera(readings) if readings else geometry.camera_pose
+    middle = float(away.translation[2]) / float(geometry.camera.parameters[0])
     corners = float(data["residuals_px"]["corner"]) * middle
     turning = {axis.name for axis in geometry.kinematics.axes if axis.kind == "rotary"}
     off = [float(v) for name, v in data.get("axes_off", {}).items() if name in turning]

@@ -10,13 +10,17 @@ from typing import Any
 import numpy as np
 
 from btfkit import documents
+from btfkit.calibration import poses
+from btfkit.calibration.board_poses import POSED
 from btfkit.calibration.calibration import Calibration, Section
 from btfkit.calibration.colours import ColourCorrection
 from btfkit.calibration.geometry import Geometry
-from btfkit.calibration.geometry_stage import LAMP, fit_geometry
+from btfkit.calibration.geometry_stage import fit_geometry
 from btfkit.calibration.lamp_stage import LIT, lamp_factors, lamp_frames
 from btfkit.calibration.noise import Fitted
+from btfkit.calibration.nominal import LAMP
 from btfkit.calibration.placement import Placement, calibrated, nominal, of_directions
+from btfkit.calibration.poses import with_poses
 from btfkit.calibration.radiometry import Radiometry
 from btfkit.calibration.references import (
     Scene,
@@ -71,8 +75,10 @@ def calibrate(
             else:
                 found = found.with_section(name, _made(sequence, name, found, placed, inputs))
                 ran.append(name)
-        if name == "geometry" and placement is None and name in found.sections:
-            placed = placed_by(found) or placed
+        if name == "geometry" and name in found.sections:
+            sequence = with_poses(sequence, found)
+            if placement is None:
+                placed = placed_by(sequence, found) or placed
         progress(done + 1, len(ORDER))
     return found, ran
 
@@ -95,7 +101,8 @@ def refuse_unfit(sequence: Frames, found: Calibration, path: Path) -> None:
                 "--calibration",
             )
         if name == "geometry":
-            placed = placed_by(found) or placed
+            sequence = with_poses(sequence, found)
+            placed = placed_by(sequence, found) or placed
 
 
 def geometry_of(found: Calibration) -> Geometry:
@@ -107,9 +114,11 @@ def geometry_of(found: Calibration) -> Geometry:
     return Geometry.from_json(found.section("geometry").data)
 
 
-def placed_by(found: Calibration) -> Placement | None:
-    """Where things are by the calibrated geometry; None where it knows no lamp."""
+def placed_by(sequence: Frames, found: Calibration) -> Placement | None:
+    """Where things are by the calibrated geometry; None where it knows no lamp, or no poses."""
     geometry = geometry_of(found)
+    if any(not sequence.frames[i].axes for i in sequence.of_kind(*POSED)):
+        return None
     return calibrated(geometry, LAMP) if LAMP in geometry.lights_mm else None
 
 
@@ -118,7 +127,7 @@ def placement_of(sequence: Frames) -> Placement:
     lit = [sequence.frames[i] for i in sequence.of_kind(*LIT)]
     if lit and all(frame.light is not None and frame.view is not None for frame in lit):
         return of_directions()
-    if not sequence.rig:
+    if poses.without_axes(sequence):
         return of_directions()
     return nominal(sequence.rig)
 
@@ -159,7 +168,8 @@ def _frames_of(sequence: Frames, name: str) -> Sequence[int]:
     if name == "lamp":
         return lamp_frames(sequence)
     if name == "geometry":
-        return sequence.of_kind("target", "sphere")
+        posed = POSED if poses.without_axes(sequence) else ("sphere",)
+        return sequence.of_kind("target", *posed)
     kinds = {"stray": "colour", "white": "white", "colour": "colour"}
     return sequence.of_kind(kinds[name])
 
@@ -171,7 +181,8 @@ def _frame_entry(sequence: Frames, index: int) -> list[Any]:
     if digest is None:
         path = sequence.path / frame.file
         digest = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "missing"
-    pose = [sorted(frame.axes.items()), frame.light, frame.view, frame.group]
+    pose: list[Any] = [sorted(frame.axes.items()), frame.light, frame.view, frame.group]
+    pose += poses.columns_of(frame)
     return [frame.file, frame.kind, digest, frame.exposure_s, frame.temperature_c, *pose]
 
 
@@ -179,12 +190,14 @@ def _lacks(sequence: Frames, name: str, found: Calibration) -> str | None:
     """Why a stage that may be absent cannot run; None where it can."""
     if name in _NEEDED or name == "lamp":
         return None
+    if name == "geometry" and poses.without_axes(sequence):
+        return poses.lacks(sequence)
     if name == "geometry":
         if not sequence.of_kind("target"):
             return "no frames of kind target"
         if "board" not in sequence.target:
             return "sequence.json has no target.board"
-        return None if sequence.rig.get("axes") else "sequence.json has no rig.axes"
+        return None
     kind = "white" if name == "white" else "colour"
     if not sequence.of_kind(kind):
         return f"no frames of kind {kind}"
@@ -211,6 +224,8 @@ def _made(
         lit, lamp = lamp_factors(sequence, radiometry)
         files = [sequence.frames[i].file for i in lit]
         return Section(inputs, {"files": files, **finite(lamp.record())})
+    if name == "geometry" and poses.without_axes(sequence):
+        return Section(inputs, finite(poses.fit_poses(sequence, radiometry)))
     if name == "geometry":
         return Section(inputs, finite(fit_geometry(sequence, radiometry).to_json()))
     stray = None if name == "stray" else stray_of(found)

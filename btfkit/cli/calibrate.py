@@ -130,6 +130,8 @@ def _of_lights(data: dict[str, Any]) -> str:
     )
     if data["positions"]:
         line += f", {data['positions']} positions in {data['unit']}"
+    if data["corrected"] and data["falloff_rms"] is None:
+        line += f"; developed in {data['corrected']}"
     if data["falloff_rms"] is not None:
         line += (
             f"; fall-off divided out to {100 * data['falloff_rms']:.2f} % in {data['corrected']}"

@@ -14,7 +14,6 @@ from btfkit.cli.outcome import Outcome, verb
 if TYPE_CHECKING:
     from btfkit.btf import BTF
     from btfkit.fitting.heightfield import Found
-    from btfkit.relief.relief import Relief
 
 
 @verb(
@@ -83,7 +82,7 @@ def heightfield_verb(
     known = truth_of(btf) if known is None else known
     if known is not None:
         figures["truth"] = {"known_by": by, **against_truth(found, known)}
-    relief = _of_three(found.relief)
+    relief = found.relief.of_three()
     unit = "mm" if relief.texel_mm else "texel"
     write(relief, final, unit=unit, force=force)
     if "preview" in names:
@@ -118,23 +117,6 @@ def _found(
     btf = btfkit.open(source)
     found = find_relief(btf, budget_s=budget, start=start, holdout=holdout, seed=seed, progress=bar)
     return found, btf
-
-
-def _of_three(relief: Relief) -> Relief:
-    """The same with colours that a relief file holds: of spectral data, grey from the mean."""
-    from dataclasses import replace
-
-    import numpy as np
-
-    from btfkit.btf import RGB
-
-    if len(relief.channels) == 3:
-        return relief
-    albedo, specular = (
-        np.repeat(part.mean(axis=2, keepdims=True), 3, axis=2)
-        for part in (relief.albedo, relief.specular)
-    )
-    return replace(relief, channels=RGB, albedo=albedo, specular=specular)
 
 
 def _line(final: Path, figures: dict[str, Any]) -> str:

@@ -86,7 +86,7 @@ def described(path: Location) -> dict[str, Any]:
         }
     found = sources.measured(path)
     if isinstance(found, BTF):
-        return {"kind": kind, "path": path, **_of_btf(found)}
+        return {"kind": kind, "path": path, **_of_btf(found, _masked(path))}
     if isinstance(found, QuerySet):
         return {"kind": kind, "path": path, **_of_queries(found)}
     h, w = found.height.shape
@@ -100,7 +100,15 @@ def described(path: Location) -> dict[str, Any]:
     }
 
 
-def _of_btf(btf: Any) -> dict[str, Any]:
+def _masked(path: Location) -> int | None:
+    """Texels of a store that hold no value; None of what is no store."""
+    from btfkit.io.store import reader
+
+    stored = reader.detect(path) if isinstance(path, Path) else reader.is_store(path)
+    return reader.masked_texels(path) if stored else None
+
+
+def _of_btf(btf: Any, masked: int | None) -> dict[str, Any]:
     from btfkit import directions
     from btfkit.btf import QUANTITY
 
@@ -118,10 +126,32 @@ def _of_btf(btf: Any) -> dict[str, Any]:
         "channels": btf.channels,
         "texel_mm": btf.texel_mm,
         "wrap": btf.wrap,
+        "maps": _maps_of(btf, masked),
         "licence": btf.licence,
         "provenance": dict(btf.provenance),
         "history": btf.history,
     }
+
+
+def _maps_of(btf: Any, masked: int | None) -> dict[str, Any]:
+    """What is known of single texels, without reading any."""
+    n, h, w, _ = btf.shape
+    found: dict[str, Any] = {}
+    if btf.validity is not None:
+        found["validity"] = {"valid": float(btf.validity.mean())}
+    elif masked is not None:
+        found["validity"] = {"valid": 1 - masked / (n * h * w)}
+    if btf.variance is not None:
+        found["variance"] = "of every value"
+    if btf.coverage is not None:
+        found["coverage"] = "of every texel"
+    if btf.footprint is not None:
+        seen = btf.footprint[np.isfinite(btf.footprint)]
+        least, most = (float(f(seen)) if seen.size else None for f in (np.min, np.max))
+        found["footprint"] = {"least_texels": least, "most_texels": most}
+    if btf.blurs is not None:
+        found["blur"] = f"of every texel, {len(btf.blurs.maps)} maps"
+    return found
 
 
 def _of_queries(queries: Any) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,9 @@ from btfkit.cli.options import (
 from btfkit.cli.outcome import Outcome, verb
 from btfkit.cli.preview import of_btf, preview_option
 from btfkit.remote import Location
+
+# A relief that is not given but found from what a first reading makes.
+_FOUND = Path("auto")
 
 
 @verb(
@@ -50,8 +54,9 @@ btfkit ingest wool/ felt.zip cord.btf --cluster local:2 -o stores""",
     help="Move each view of a sequence onto the squarest; by default where calibration is poor.",
 )  # fmt: skip
 @click.option(
-    "--relief", type=click.Path(path_type=Path), help="Heights of a sequence's sample, to register."
-)
+    "--relief", type=click.Path(path_type=Path), metavar="FILE.exr|auto",
+    help="Heights of a sequence's sample, to register its views; auto finds them first.",
+)  # fmt: skip
 @click.option("--partial", is_flag=True, default=None, help="Take a run with gaps, masking them.")
 @click.option(
     "--direction-residual", type=float,
@@ -88,7 +93,7 @@ def ingest_verb(
 
     -o may be a URL that fsspec reaches (s3://bucket/wool.btf.zarr; extra `remote`).
     """
-    from btfkit.ingest import Part, ingest, store_name
+    from btfkit.ingest import Part, ingest, ingest_on_found_relief, store_name
 
     rows, cols = roi or (slice(None), slice(None))
     everything = slice(None)
@@ -97,6 +102,8 @@ def ingest_verb(
         "options": options,
         "part": Part(rows, cols, lights or everything, views or everything),
     }
+    if cluster and options["relief"] == _FOUND:
+        raise click.UsageError("--relief auto reads a sequence twice: leave out --cluster")
     if cluster:
         from btfkit.cluster import connected
         from btfkit.shards import Asked, ingest_all
@@ -109,17 +116,14 @@ def ingest_verb(
         with connected(cluster) as workers:
             bar.phase("reading and writing")
             return told(ingest_all(workers, targets, Asked(given, dtype, force, closing), bar))
-    path = ingest(
-        the_one(sources, "sources"),
-        out,
-        dtype=dtype,
-        jobs=jobs,
-        force=force,
-        progress=bar,
-        phase=bar.phase,
-        **given,
-    )
-    return _written(path, preview=preview)
+    writing = {"dtype": dtype, "jobs": jobs, "force": force, "progress": bar, "phase": bar.phase}
+    source = the_one(sources, "sources")
+    if options["relief"] != _FOUND:
+        return _written(ingest(source, out, **writing, **given), preview=preview)
+    given["options"] = {name: value for name, value in options.items() if name != "relief"}
+    path, relief = ingest_on_found_relief(source, out, seed=seed, **writing, **given)
+    made = _written(path, preview=preview)
+    return replace(made, data={**made.data, "relief": relief})
 
 
 def _written(path: Location, *, preview: bool) -> Outcome:

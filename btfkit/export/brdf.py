@@ -88,6 +88,7 @@ def _one_texel(btf: BTF, texel: str) -> BTF:
         raise ValueError(f"texel {texel} is measured under no pair")
     one = replace(
         btf, textures=as_textures(values), light=light, view=view, light_position=None,
-        view_position=None, validity=None, variance=None, footprint=None, wrap="wrap",
+        view_position=None, validity=None, variance=None, footprint=None,
+        coverage=None, blurs=None, wrap="wrap",
     )  # fmt: skip
     return one.subset(known)

@@ -102,6 +102,16 @@ class Relief:
         """Tile width / tile height."""
         return self.height.shape[1] / self.height.shape[0]
 
+    def of_three(self) -> Relief:
+        """The same with colours that a relief file holds: of spectral data, grey from the mean."""
+        if len(self.channels) == 3:
+            return self
+        albedo, specular = (
+            np.repeat(part.mean(axis=2, keepdims=True), 3, axis=2)
+            for part in (self.albedo, self.specular)
+        )
+        return replace(self, channels=RGB, albedo=albedo, specular=specular)
+
     def under_surface(self) -> tuple[Relief, float]:
         """The same with its highest point at 0, for a bounding surface, and what was added."""
         shift = -float(self.height.max())

@@ -137,6 +137,9 @@ def tile_btf(btf: BTF, *, drift: bool = True) -> tuple[BTF, Tiling]:
         "wrap": "wrap",
         "provenance": {**btf.provenance, "tiled": tiling.record() | {"looked_at": chosen}},
         "history": (*btf.history, tiling.line()),
+        # A texel of a tile is mixed of several.
+        "coverage": None,
+        "blurs": None,
         **_far(btf, index),
     }
     change = 0.0

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sources
+import zarr
 
 import btfkit
 from btfkit import counts
@@ -105,7 +106,7 @@ def test_a_window_merges_only_the_pixels_that_it_needs(run, monkeypatch):
     [
         (lambda d: d["target"].pop("sample"), r"no target.sample.size_mm.*width and height"),
         (lambda d: d["target"]["sample"].update(size_mm=[5]), r"found \[5\]"),
-        (lambda d: d.pop("rig"), r"rig of sequence.json does not tell"),
+        (lambda d: d.pop("rig"), r"has no rig.axes, and 4 sample frames have no light_x.*describe rig.axes"),
         (lambda d: d["rig"]["camera"].pop("focal_px"), r"focal_px.*add axes"),
         (lambda d: d["rig"].update(light={}), r"rig of sequence.json does not tell where camera and light are"),
         (lambda d: d["rig"]["axes"][0].update(direction=[0, 0, 0]), r"axis 'ring' has no direction"),
@@ -236,6 +237,10 @@ def test_a_part_of_a_run_is_refused_by_what_is_missing_and_masked_when_asked(run
     # Pairs 2 and 5 are both views under the third light.
     np.testing.assert_allclose(btf.light[4:], [[-np.sqrt(0.75), 0, 0.5]] * 2, atol=1e-6)
     np.testing.assert_allclose(btf.view[5], [np.sqrt(0.5), 0, np.sqrt(0.5)], atol=1e-6)
+    # Of a pair whose frame is gone it is known where its texels would lie; of the others not.
+    assert np.isfinite(btf.blurs.of_pair(3)).any()
+    assert np.isnan(btf.blurs.of_pair(5)).all()
+    assert (btf.coverage[5] == 0).all()
 
 
 def test_a_plan_with_pairs_of_its_own_and_a_whole_run_lack_nothing(run):
@@ -251,6 +256,54 @@ def test_a_run_none_of_whose_frames_is_there_is_refused(run):
         path.unlink()
     with pytest.raises(CalibrationError, match="none of the sample's frames is there"):
         btfkit.open(run, partial=True)
+
+
+def test_a_store_of_a_sequence_says_of_every_texel_whether_how_much_and_how_sharply_it_was_seen(
+    run, tmp_path, capsys
+):
+    from btfkit.cli import btfkit as verbs
+    from btfkit.cli.outcome import run as called
+
+    store = tmp_path / "run.btf.zarr"
+    asked = ["ingest", str(run), "-o", str(store), "--texel-mm", "0.5", "--dtype", "float32"]
+    assert called(verbs, [*asked, "--no-preview", "--quiet"]) == 0
+    kept, made = btfkit.open(store), btfkit.open(run, texel_mm=0.5)
+    group = zarr.open_group(store, mode="r")
+    # Two views, each under two lights.
+    assert group["blur"].shape == (2, 12, 14, 3)
+    assert group["blur_of"][:].tolist() == [0, 0, 1, 1]
+    assert kept.validity is None
+    for pair in range(4):
+        texture = made.texture(pair)
+        np.testing.assert_array_equal(kept.texture(pair), texture)
+        np.testing.assert_array_equal(group["validity"][pair], np.isfinite(texture[..., 0]))
+        coverage = kept.coverage[pair][..., 0]
+        # half: steps of 2^-11 below 1
+        np.testing.assert_allclose(coverage, made.coverage[pair][..., 0], atol=2**-11)
+        assert (coverage[np.isfinite(texture[..., 0])] > 0.9 - 2**-11).all()
+        where = made.textures.footprints(pair)
+        np.testing.assert_array_equal(kept.blurs.of_pair(pair), where.blur)
+        mean = np.sqrt(np.mean(where.footprint**2))
+        # `footprint` is of nine places, which a near camera sees at up to 4 % other distances.
+        np.testing.assert_allclose(kept.footprint[pair], mean, rtol=0.02)
+    part = kept.subset([3]).crop(slice(2, 6), slice(3, 13))
+    assert part.blurs.maps.shape == (1, 4, 10, 3)
+    np.testing.assert_array_equal(part.blurs.of_pair(0), kept.blurs.of_pair(3)[2:6, 3:13])
+    np.testing.assert_array_equal(part.coverage[0], kept.coverage[3][2:6, 3:13])
+    again = tmp_path / "again.btf.zarr"
+    assert (
+        called(verbs, ["ingest", str(store), "-o", str(again), "--lights", "1:2", "--no-preview"])
+        == 0
+    )
+    np.testing.assert_array_equal(btfkit.open(again).blurs.of_pair(1), kept.blurs.of_pair(3))
+    capsys.readouterr()
+    assert called(verbs, ["info", str(store), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])["maps"]
+    valid = np.mean([np.isfinite(made.texture(k)[..., 0]).mean() for k in range(4)])
+    assert told["validity"]["valid"] == pytest.approx(valid)
+    assert told["blur"] == "of every texel, 2 maps"
+    assert told["coverage"] == "of every texel"
+    assert 0.49 < told["footprint"]["least_texels"] <= told["footprint"]["most_texels"]
 
 
 def cloth(run, high_mm):

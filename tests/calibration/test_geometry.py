@@ -7,7 +7,7 @@ import turntables
 from kornia.geometry.calibration import distort_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
-from btfkit.calibration import bundle_problem
+from btfkit.calibration import bundle_parameters
 from btfkit.calibration.board import Board
 from btfkit.calibration.bundle import Sighting, SphereSighting, adjust
 from btfkit.calibration.bundle_problem import Problem
@@ -133,7 +133,7 @@ def test_derivatives_of_a_tilting_turning_sample_and_the_optimum_are_those_of_au
     monkeypatch,
 ):
     # Corners alone, without what the drawing of the rig says: that is not in the torch twin.
-    monkeypatch.setattr(bundle_problem, "_DRAWN", {"turn": 1e9, "mm": 1e9, "light": 1e9})
+    monkeypatch.setattr(bundle_parameters, "_DRAWN", {"turn": 1e9, "mm": 1e9, "light": 1e9})
     rng = np.random.default_rng(3)
     rig = turntables.Turntable(rng)
     views = [readings(k, 6) for k in range(6)]
@@ -176,7 +176,7 @@ def test_derivatives_of_a_tilting_turning_sample_and_the_optimum_are_those_of_au
     residual = residuals(*given).numpy()
     jacobians = torch.autograd.functional.jacobian(residuals, given)
     problem = Problem(best, seen, (), slip_sd={})
-    ours, slopes = problem.evaluate(np.zeros(problem.size))
+    ours, slopes = problem.evaluate(np.zeros(problem.parameters.size))
     corners = len(residual)
     scale = problem.sd_px("corner")
     np.testing.assert_allclose(ours[:corners] * scale, residual, atol=1e-9)
@@ -187,7 +187,7 @@ def test_derivatives_of_a_tilting_turning_sample_and_the_optimum_are_those_of_au
     # At the optimum no free parameter of the other formulation has a slope left either, beside
     # what one standard deviation of it would cost.
     for index, held in (
-        (0, [i for i, n in enumerate(problem.names[:9]) if n in found.held]),
+        (0, [i for i, n in enumerate(problem.parameters.names[:9]) if n in found.held]),
         (2, []),
     ):
         jacobian = jacobians[index].numpy().reshape(len(residual), -1)
@@ -211,16 +211,16 @@ def test_derivatives_of_every_parameter_of_a_rig_with_spheres_are_differences_of
         sphere_sightings(rig, views, rng),
         slip_sd=slip_sd,
     )
-    x = 0.3 * rng.standard_normal(problem.size) * problem.scale
+    x = 0.3 * rng.standard_normal(problem.parameters.size) * problem.parameters.scale
     _, slopes = problem.evaluate(x)
-    slopes = slopes.toarray() * problem.scale
-    for k in range(problem.size):
-        step = np.zeros(problem.size)
-        step[k] = 1e-5 * problem.scale[k]
+    slopes = slopes.toarray() * problem.parameters.scale
+    for k in range(problem.parameters.size):
+        step = np.zeros(problem.parameters.size)
+        step[k] = 1e-5 * problem.parameters.scale[k]
         difference = (problem.evaluate(x + step)[0] - problem.evaluate(x - step)[0]) / 2e-5
         # central differences of residuals of up to 1e5: rounding 1e-11 / 1e-5, and cubic terms
         np.testing.assert_allclose(
-            slopes[:, k], difference, rtol=1e-5, atol=2e-3, err_msg=problem.names[k]
+            slopes[:, k], difference, rtol=1e-5, atol=2e-3, err_msg=problem.parameters.names[k]
         )
 
 

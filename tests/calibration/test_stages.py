@@ -241,6 +241,24 @@ def test_saturated_references_are_named(folder):
         stages.calibrate(sequence)
 
 
+def test_saturated_references_of_drift_are_named(folder):
+    sequence = edited(folder, frames=lambda f: replace(f, lamp=None))
+    for i in sequence.of_kind("reference"):
+        full = np.full((240, 320), 4095, np.uint16)
+        (folder / sequence.frames[i].file).write_bytes(counts.encode_png(full))
+    name = sequence.frames[sequence.of_kind("reference")[0]].file
+    with pytest.raises(CalibrationError, match=rf"{name}: the reference frames saturate"):
+        stages.calibrate(sequence)
+
+
+def test_patches_without_a_reflectance_are_named(folder, calibrated):
+    patches = json.loads((folder / "sequence.json").read_text())["target"]["patches"]
+    patches[3] = {**patches[3], "reflectance": [0.5, 2.0, 0.1]}
+    sequence = edited(folder, target={"patches": patches})
+    with pytest.raises(CalibrationError, match=r"patches\[3\] of sequence.json has reflectance"):
+        stages.calibrate(sequence, calibrated[0])
+
+
 def test_saturated_flats_and_lit_darks_are_named(folder):
     sequence = Sequence.open(folder)
     first = sequence.frames[sequence.of_kind("flat")[0]].file

@@ -2,8 +2,8 @@
 
     texture (n, h, w, c) float16 or float32, one chunk a texture, sharded by a run of pairs
     light, view (n, 3) float32            optional: light_position, view_position (n, 3) mm,
-    validity, variance, footprint         attributes: what `BTF` says about itself,
-                                          and masked_texels, how many texels are NaN
+    validity, variance, footprint,        attributes: what `BTF` says about itself,
+    coverage, blur, blur_of               and masked_texels, how many texels are NaN
 
 Every chunk is compressed and carries a CRC32C, so a damaged one is told, never answered.
 """
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from btfkit import native
 from btfkit.btf import BTF, QUANTITY
 from btfkit.errors import FormatError
+from btfkit.footprint import Blurs
 from btfkit.io.store.chunks import Chunks, are_ours
 from btfkit.remote import Location, Remote
 from btfkit.textures import Array, Index, Textures
@@ -34,6 +35,8 @@ _BAND_BYTES = 64 << 20
 # The attribute that makes a group a store of ours: its version.
 MARK = "btfkit"
 _MARKED = f'"{MARK}"'.encode()
+# The attribute of a store whose validity is that a texture's value is finite.
+SAID_BY_TEXTURES = "validity_is_finite"
 _AGAIN = "ingest the source again, or copy the store again"
 
 
@@ -92,11 +95,23 @@ def read(path: Location) -> BTF:
             view=_required(path, small("view", (n, 3)), "view"),
             light_position=small("light_position", (n, 3)),
             view_position=small("view_position", (n, 3)),
-            validity=small("validity", (n, h, w), (1, h, w), kind="b"),
+            # Where textures say it themselves, by NaN, a copy of it in memory says no more.
+            validity=None
+            if attributes.get(SAID_BY_TEXTURES)
+            else small("validity", (n, h, w), (1, h, w), kind="b"),
             variance=StoreTextures(path, _member(path, group, "variance"))
             if "variance" in group
             else None,
             footprint=small("footprint", (n,)),
+            coverage=StoreTextures(path, _member(path, group, "coverage"))
+            if "coverage" in group
+            else None,
+            blurs=Blurs(
+                StoreTextures(path, _member(path, group, "blur")),
+                _required(path, small("blur_of", (n,), kind="i"), "blur_of"),
+            )
+            if "blur" in group
+            else None,
             **_said(attributes),
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -205,7 +220,7 @@ class StoreTextures(Textures):
 
 def shard_name(array: str, shard: int) -> str:
     """A shard of an image array inside its store: Zarr's default chunk key encoding."""
-    return f"{array}/c/{shard}/0/0/0"
+    return f"{array}/c/{shard}/0/0" + ("" if array == "validity" else "/0")
 
 
 def _required(path: Location, array: NDArray[Any] | None, name: str) -> NDArray[Any]:

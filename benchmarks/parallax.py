@@ -1,0 +1,64 @@
+"""What relief does to registration: the shifts that are found where there is none.
+
+    python benchmarks/parallax.py [--sample woven]
+
+A perfect rig of the twin whose drawing is true (480 x 360, seven views to 55 degrees, ten lights,
+no target): every shift between views is the relief's parallax, or noise. Without a relief, on the
+relief that the first store implies (ingest --relief auto), and on the true one. About 60 CPU s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import btfkit
+from btfkit.devices import mock
+from btfkit.devices.capture.plan import from_document
+from btfkit.devices.capture.run import measure
+from btfkit.devices.twin.log import Twin, TwinLog, everything
+from btfkit.ingest import ingest, ingest_on_found_relief
+from btfkit.relief import file as relief_file
+
+PLAN: dict[str, Any] = {
+    "views": [[0, 0], [30, 20], [30, 200], [55, 80], [55, 170], [55, 260], [55, 350]], "lights": 10,
+    "targets": 0, "spheres": 0, "whites": 0, "colours": 0, "reference_every": 0, "warm_s": 0,
+    "exposures": {"count": 2, "ratio": 4},
+}  # fmt: skip
+
+
+def main() -> None:
+    """A line a way."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sample", default="woven")
+    parser.add_argument("--seed", type=int, default=8)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        here = Path(folder)
+        run = here / "run"
+        twin = Twin(given.sample, 480, 360, given.seed, everything())
+        log = TwinLog(run, twin)
+        rig = mock.open_rig(log.begin(), log=log)
+        measure(rig, from_document("parallax", PLAN), run, synthetic=True)
+        relief_file.write(twin.relief(), here / "true.exr", unit="tile")
+        flat = {"register": True}
+        stores = {
+            "without a relief": ingest(run, here / "flat.btf.zarr", options=flat),
+            "on the true one": ingest(
+                run, here / "true.btf.zarr", options={**flat, "relief": here / "true.exr"}
+            ),
+        }
+        stores["on the found one"], _ = ingest_on_found_relief(run, here / "found.btf.zarr")
+        for name, store in stores.items():
+            told = btfkit.open(store).provenance["registration"]
+            print(
+                f"{name}: {told['rms_texels']:.3f} texels rms, {told['largest_texels']:.3f} at "
+                f"most, {len(told['untold'])} of {told['views']} views untold",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
