@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable
@@ -53,6 +54,9 @@ def _child(job: Callable[[], int], after_s: float | None, log: Path) -> int:
                 code = job()
                 sys.stdout.flush()
                 sys.stderr.flush()
+        except BaseException:
+            with log.open("a") as file:
+                traceback.print_exc(file=file)
         finally:
             os._exit(code)
     if after_s is not None:
