@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sources
+import xarray
 import zarr
 
 import btfkit
@@ -269,6 +270,11 @@ def test_a_store_of_a_sequence_says_of_every_texel_whether_how_much_and_how_shar
     assert called(verbs, [*asked, "--no-preview", "--quiet"]) == 0
     kept, made = btfkit.open(store), btfkit.open(run, texel_mm=0.5)
     group = zarr.open_group(store, mode="r")
+    with xarray.open_zarr(store, consolidated=False) as opened:
+        assert dict(opened.sizes) == {
+            "pair": 4, "row": 12, "column": 14, "channel": 1, "share": 1, "xyz": 3, "posed": 2,
+            "uu_uv_vv": 3,
+        }  # fmt: skip
     # Two views, each under two lights.
     assert group["blur"].shape == (2, 12, 14, 3)
     assert group["blur_of"][:].tolist() == [0, 0, 1, 1]
