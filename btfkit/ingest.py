@@ -22,6 +22,7 @@ from btfkit.io import listing
 from btfkit.io.store import reader as store
 from btfkit.io.store import writer
 from btfkit.io.store.places import place_of
+from btfkit.jsonvalues import plain
 from btfkit.remote import Location, Remote, located
 
 # Files up to this size are hashed whole; of larger ones the two ends and the size.
@@ -123,7 +124,8 @@ def ingest_on_found_relief(
     """A sequence twice: the relief that the first store implies registers the views of the second.
 
     Relief moves texels of tilted views against each other as a shift would; on the relief they are
-    compared without parallax.
+    compared without parallax. Views of the first are registered as they are: what that takes out
+    is the parallax of the mean height, which a relief does not have.
 
     Args:
         source, out, part, writing: as `ingest`'s.
@@ -150,7 +152,7 @@ def ingest_on_found_relief(
     told = phase or (lambda part: None)
     relief = refuse_existing(final.with_name(f"{final.name.removesuffix('.btf.zarr')}.relief.exr"),
                              force=force)  # fmt: skip
-    given = dict(options or {})
+    given = {**(options or {}), "register": True}
     place_of(final, force=force)
     with tempfile.TemporaryDirectory(dir=final.absolute().parent, prefix=".first-") as folder:
         first = Path(folder) / "first.btf.zarr"
@@ -160,7 +162,7 @@ def ingest_on_found_relief(
         btf = io.open(first)
         found = find_relief(btf, seed=seed, progress=progress).relief
         relief_file.write(found.of_three(), relief, unit="mm", force=force)
-    given |= {"relief": relief, "register": True}
+    given["relief"] = relief
     return ingest(source, final, format=name, options=given, part=part, phase=phase,
                   progress=progress, **writing), relief  # fmt: skip
 
@@ -191,7 +193,7 @@ def recorded(
         "source": str(source),
         "format": name,
         "hash": source_hash(located(source)),
-        "options": {**given, **settled, **_part_record(taken)},
+        "options": plain({**given, **settled, **_part_record(taken)}),
         "versions": {
             "btfkit": importlib.metadata.version("btfkit"),
             "python": platform.python_version(),

@@ -115,10 +115,11 @@ class Sequence:
         }
         text = table.read_text(encoding="utf-8-sig")
         frames, missing = parse_table(table, text, linear=linear)
+        stated = _section(folder, document, "sensor")
         return Sequence(
             path=folder,
             frames=frames,
-            sensor=_sensor(folder, _section(folder, document, "sensor")),
+            sensor=_sensor(folder, {**_of_raw(folder, frames, stated), **stated}),
             rig=rig,
             target=_section(folder, document, "target"),
             document=document,
@@ -185,6 +186,21 @@ def _section(folder: Path, document: Mapping[str, Any], name: str) -> dict[str, 
     if not isinstance(section, dict):
         raise FormatError(folder / DOCUMENT, f"{name} is {str(section)[:40]}; expected an object")
     return section
+
+
+def _of_raw(folder: Path, frames: tuple[Frame, ...], stated: Mapping[str, Any]) -> dict[str, Any]:
+    """What the first RAW frame says of its sensor, where the document does not say it all."""
+    wanted = {"width", "height", "black", "white", "cfa"}
+    raw = [frame.file for frame in frames if Path(frame.file).suffix.lower() in counts.RAW]
+    if not raw or wanted <= stated.keys():
+        return {}
+    path = folder / raw[0]
+    if not path.is_file():
+        return {}
+    file = counts.read_raw(str(path), path.read_bytes())
+    height, width = file.mosaic.shape
+    return {"width": width, "height": height, "black": float(file.black.mean()),
+            "white": file.white, "cfa": file.cfa}  # fmt: skip
 
 
 def _sensor(folder: Path, section: Mapping[str, Any]) -> Sensor:

@@ -222,3 +222,26 @@ def test_a_fit_that_kills_every_worker_is_named_and_the_rest_is_done(
         cluster.drain()
     assert "every worker that took it died" in str(ended["poison"].error)
     assert [ended[str(i)].value for i in range(4)] == [0, 1, 2, 3]
+
+
+@clustered
+@pytest.mark.slow
+def test_several_sequences_are_calibrated_each_a_task_and_a_bad_one_is_named(
+    scheduler: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    days = []
+    for name in ("monday", "tuesday"):
+        (tmp_path / name).mkdir()
+        days.append(sources.SOURCES["sequence"](tmp_path / name))
+    (tmp_path / "empty").mkdir()
+    code, told, _ = call(
+        capsys, "calibrate", *days, tmp_path / "empty", "--cluster", scheduler.scheduler_address
+    )
+    assert code == 1
+    assert told["error"]["message"] == "1 of 3 failed: empty"
+    assert "no photographs; expected" in told["failed"][0]["message"]
+    assert [each["out"] for each in told["done"]] == [str(d / "calibration.json") for d in days]
+    # As each says alone, where nothing is left to do.
+    code, alone, _ = call(capsys, "calibrate", days[0])
+    assert (code, alone["ran"]) == (0, [])
+    assert alone["figures"] == told["done"][0]["figures"]

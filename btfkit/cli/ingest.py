@@ -102,6 +102,8 @@ def ingest_verb(
         "options": options,
         "part": Part(rows, cols, lights or everything, views or everything),
     }
+    if options["relief"] == _FOUND and options["register"] is False:
+        raise click.UsageError("--relief auto registers views: leave out --no-register")
     if cluster and options["relief"] == _FOUND:
         raise click.UsageError("--relief auto reads a sequence twice: leave out --cluster")
     if cluster:

@@ -9,6 +9,7 @@ from typing import Any
 DRIVERS: dict[str, str] = {
     "usb": "btfkit.devices.usb",
     "mock": "btfkit.devices.mock",
+    "gphoto2": "btfkit.devices.gphoto2",
 }
 
 

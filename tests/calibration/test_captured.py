@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sources
+import xarray
 import zarr
 
 import btfkit
@@ -269,6 +270,11 @@ def test_a_store_of_a_sequence_says_of_every_texel_whether_how_much_and_how_shar
     assert called(verbs, [*asked, "--no-preview", "--quiet"]) == 0
     kept, made = btfkit.open(store), btfkit.open(run, texel_mm=0.5)
     group = zarr.open_group(store, mode="r")
+    with xarray.open_zarr(store, consolidated=False) as opened:
+        assert dict(opened.sizes) == {
+            "pair": 4, "row": 12, "column": 14, "channel": 1, "share": 1, "xyz": 3, "posed": 2,
+            "uu_uv_vv": 3,
+        }  # fmt: skip
     # Two views, each under two lights.
     assert group["blur"].shape == (2, 12, 14, 3)
     assert group["blur_of"][:].tolist() == [0, 0, 1, 1]
@@ -367,3 +373,46 @@ def test_views_are_compared_without_parallax_where_the_relief_is_known(run, tmp_
     file.write(wide, tmp_path / "wide.exr")
     with pytest.raises(CalibrationError, match=r"wide.exr is 20 x 10 texels; the sample's area is"):
         btfkit.open(run, relief=tmp_path / "wide.exr")
+
+
+@pytest.mark.slow
+def test_a_relief_found_from_a_first_store_registers_the_second(run, tmp_path, monkeypatch):
+    from types import SimpleNamespace
+
+    from btfkit.cli import btfkit as verbs
+    from btfkit.cli.outcome import run as called
+    from btfkit.fitting import heightfield
+    from btfkit.relief import file
+    from btfkit.relief.relief import Relief
+
+    cloth(run, 0.12)
+    shown = []
+
+    def found(btf, *, seed, progress):
+        # What a fit of a real cloth would find; four pictures tell none.
+        shown.append((btf.shape, seed, btf.provenance["registration"]["largest_texels"]))
+        half = np.full((20, 24, 3), 0.5, np.float32)
+        relief = Relief(np.full((20, 24), 0.12 / 6, np.float32), half, 0 * half, half[..., 0],
+                        texel_mm=0.25)  # fmt: skip
+        return SimpleNamespace(relief=relief)
+
+    monkeypatch.setattr(heightfield, "find_relief", found)
+    out = tmp_path / "cloth.btf.zarr"
+    line = ["ingest", str(run), "-o", str(out), "--texel-mm", "0.25", "--relief", "auto",
+            "--no-preview", "--seed", "3"]  # fmt: skip
+    assert called(verbs, line) == 0
+    assert shown[0][:2] == ((4, 20, 24, 1), 3)
+    # The first saw parallax as shifts; the second none.
+    assert shown[0][2] > 0.1
+    assert btfkit.open(out).provenance["registration"]["largest_texels"] < 0.02
+    assert file.read(tmp_path / "cloth.relief.exr").size == (20, 24)
+    # What was typed is kept as text.
+    assert btfkit.open(out).provenance["options"]["relief"] == str(tmp_path / "cloth.relief.exr")
+    left = {path.name for path in tmp_path.iterdir() if path != run}
+    assert left == {"cloth.btf.zarr", "cloth.relief.exr"}
+    assert called(verbs, line) == 1
+    assert called(verbs, [*line, "--force"]) == 0
+    assert called(verbs, [*line, "--force", "--cluster", "local:2"]) == 2
+    assert called(verbs, [*line, "--force", "--no-register"]) == 2
+    other = tmp_path / "again.btf.zarr"
+    assert called(verbs, ["ingest", str(out), "-o", str(other), "--relief", "auto"]) == 1

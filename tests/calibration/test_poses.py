@@ -14,6 +14,7 @@ from btfkit import counts
 from btfkit.calibration.board import Board
 from btfkit.calibration.board_poses import Finder
 from btfkit.calibration.camera_model import Camera
+from btfkit.calibration.folders import calibrate_sequence
 from btfkit.calibration.sensor_stage import fit_sensor
 from btfkit.calibration.stages import calibrate
 from btfkit.errors import CalibrationError
@@ -82,6 +83,10 @@ def test_poses_in_the_table_give_the_textures_that_axes_give(axes_run, tmp_path)
     assert found.section("geometry").data["poses_from"] == {"table": 2}
     _, ran = calibrate(Sequence.open(run), found)
     assert ran == []
+    told = calibrate_sequence(run, None, force=False, progress=lambda done, total: None)
+    page = told["report"].read_text()
+    assert "Poses of single frames, there being no axes, from" in page
+    assert "table of 2 views" in page
 
 
 def test_a_camera_that_stands_still_needs_directions_of_light_alone(axes_run):

@@ -9,6 +9,7 @@ from balls import Scene, dome
 from btfkit import counts
 from btfkit.calibration import raw
 from btfkit.errors import FormatError
+from btfkit.sequence import Frame, Sequence, save
 
 pytest.importorskip("rawpy", reason="the extra raw is not installed")
 
@@ -91,6 +92,19 @@ def test_what_saturates_is_one_and_other_mosaics_are_refused():
         counts.read_raw("a.dng", dng(shot(bright), pattern=(1, 1, 0, 2)))
     with pytest.raises(FormatError, match="not a readable RAW file"):
         counts.read_raw("a.dng", b"II*\0" + bytes(40))
+
+
+def test_a_sequence_of_raw_frames_has_the_levels_and_the_mosaic_of_its_files(tmp_path):
+    picture = np.full((40, 60, 3), 0.5)
+    (tmp_path / "a.dng").write_bytes(dng(shot(picture)))
+    save(tmp_path, [Frame("a.dng", "sample")], {"sensor": {"bits": 12}})
+    sensor = Sequence.open(tmp_path).sensor
+    assert (sensor.width, sensor.height, sensor.bits) == (60, 40, 12)
+    assert (sensor.black, sensor.white, sensor.cfa) == (BLACK, WHITE, "RGGB")
+    # What the document says counts more.
+    save(tmp_path, [Frame("a.dng", "sample")], {"sensor": {"white": 3900}}, force=True)
+    assert Sequence.open(tmp_path).sensor.white == 3900
+    np.testing.assert_array_equal(Sequence.open(tmp_path).image(0), shot(picture))
 
 
 @pytest.mark.slow

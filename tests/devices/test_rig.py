@@ -47,7 +47,7 @@ def test_every_driver_finds_and_opens_rigs(name):
 
 
 def test_no_other_driver_is_known():
-    with pytest.raises(ValueError, match="no driver 'serial'; expected one of usb, mock"):
+    with pytest.raises(ValueError, match="no driver 'serial'; expected one of usb, mock, gphoto2"):
         driver("serial")
 
 

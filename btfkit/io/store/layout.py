@@ -60,7 +60,8 @@ def create(where: str, btf: BTF, *, dtype: str, run: int) -> None:
             dtype={"texture": dtype, "coverage": "float16"}.get(name, "float32"),
             compressors=_codecs(),
             fill_value=float("nan"),
-            dimension_names=IMAGE_AXES,
+            # By its own name: an axis of another length is another one.
+            dimension_names=(*IMAGE_AXES[:3], "share" if name == "coverage" else IMAGE_AXES[3]),
             config={"write_empty_chunks": True},
         )
     small: dict[str, tuple[Any, tuple[str, ...]]] = {
