@@ -19,6 +19,12 @@ _FLAGS = (
     "--enable-logging=stderr", "--log-level=0",
 )  # fmt: skip
 
+# WebGPU in software: a swap chain shares its images by Vulkan, which --disable-gpu takes away.
+_WEBGPU = tuple(flag for flag in _FLAGS if flag != "--disable-gpu") + (
+    "--enable-unsafe-webgpu", "--enable-features=Vulkan", "--use-vulkan=swiftshader",
+    "--use-webgpu-adapter=swiftshader",
+)  # fmt: skip
+
 
 class Seen(NamedTuple):
     """A page after its scripts ran.
@@ -51,9 +57,9 @@ def chromium() -> str:
     return found or ""
 
 
-def load(page: Path | str, *flags: str) -> Seen:
+def load(page: Path | str, *flags: str, webgpu: bool = False) -> Seen:
     """The page, or what lies at an address, once loaded."""
-    done = _run(page, "--dump-dom", *flags)
+    done = _run(page, "--dump-dom", *flags, base=_WEBGPU if webgpu else _FLAGS)
     return Seen(done.stdout, _console(done.stderr))
 
 
@@ -66,11 +72,13 @@ def screenshot(
     return Seen(done.stdout, _console(done.stderr))
 
 
-def _run(page: Path | str, *flags: str) -> subprocess.CompletedProcess[str]:
+def _run(
+    page: Path | str, *flags: str, base: tuple[str, ...] = _FLAGS
+) -> subprocess.CompletedProcess[str]:
     address = page if isinstance(page, str) else page.resolve().as_uri()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         return subprocess.run(
-            [chromium(), *_FLAGS, f"--user-data-dir={profile}", *flags, address],
+            [chromium(), *base, f"--user-data-dir={profile}", *flags, address],
             capture_output=True, text=True, timeout=120, check=True,
         )  # fmt: skip
 

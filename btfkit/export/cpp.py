@@ -14,7 +14,6 @@ from btfkit.conventions import (
     CURVED_FINER,
     EPSILON,
     LEAK,
-    LEAST_FACING,
     LEVELS_UNIT,
     LOOKS,
     LOWEST_COSINE,
@@ -24,9 +23,10 @@ from btfkit.conventions import (
     SLACK,
     STEEPEST,
 )
+from btfkit.export import lobes
 from btfkit.export.arrays import narrowed
 from btfkit.export.numbers import literal
-from btfkit.export.sections import filled, sections, whole_text
+from btfkit.export.sections import filled, sections
 from btfkit.materials.base import Material
 from btfkit.native.neural import bent
 from btfkit.native.neural.plain import YUV_TO_RGB
@@ -60,13 +60,7 @@ def write(material: Material, program: Program, folder: Path) -> None:
     header, numbers = source(program, model=material.model, texel_mm=material.header.texel_mm)
     (folder / "material.hpp").write_text(header)
     (folder / "material.bin").write_bytes(numbers)
-    rows, columns = material.lobes.levels[0].shape[:2]
-    into = "{0} - std::floor({0})" if program.wrap else "std::clamp({0}, 0.0, 1.0)"
-    lobes = filled(
-        whole_text("lobes.hpp.txt"), h=rows, w=columns, facing=LEAST_FACING,
-        reduced_u=into.format("u"), reduced_v=into.format("v"),
-    )  # fmt: skip
-    (folder / "lobes.hpp").write_text(lobes)
+    (folder / "lobes.hpp").write_text(lobes.cpp(material))
     example = sections("material.hpp.txt")["example"]
     (folder / "example.cpp").write_text(filled(example, space=SPACE, **_curvature(program)))
 
@@ -239,7 +233,9 @@ def _networks(program: Program, store: _Store) -> list[str]:
         name, place = ("c", "kCover") if isinstance(part, Cover) else ("d", "kDepth")
         store.levels(place, (part.texture.levels[0],))
         k, psi = part.texture.levels[0].shape[-1], f"{name}_psi"
-        known = _INPUTS | {feature: f"{psi}[{i}]" for i, feature in enumerate(part.texture.features)}
+        known = _INPUTS | {
+            feature: f"{psi}[{i}]" for i, feature in enumerate(part.texture.features)
+        }
         found += [f"float {psi}[{k}] = {{}};", f"lookup<{k}>({place}[0], uv[0], uv[1], 1, {psi});"]
         found += _gathered(f"{name}0", part.inputs, known)
         found += _layers(name, part.layers, store, rounded=program.rounded)

@@ -84,9 +84,7 @@ def _depth(depth: Heights | DepthNetwork | OffsetNetwork, folder: Path) -> dict[
     return found
 
 
-def _network(
-    part: DepthNetwork | OffsetNetwork | Cover, name: str, folder: Path
-) -> dict[str, Any]:
+def _network(part: DepthNetwork | OffsetNetwork | Cover, name: str, folder: Path) -> dict[str, Any]:
     """A network with a texture of its own, which becomes the files of this name."""
     return {
         "texture": _texture(part.texture, name, folder),

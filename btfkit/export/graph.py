@@ -86,6 +86,9 @@ class Value:
     def __and__(self, other: Value) -> Value:
         return self._with("And", other)
 
+    def __or__(self, other: Value) -> Value:
+        return self._with("Or", other)
+
     def __matmul__(self, other: Value) -> Value:
         return self._with("MatMul", other)
 

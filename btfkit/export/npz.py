@@ -22,6 +22,7 @@ from btfkit.conventions import (
     STEEPEST,
 )
 from btfkit.export.arrays import named
+from btfkit.export.curvature import words
 from btfkit.export.sections import filled, sections
 from btfkit.materials.base import Material
 from btfkit.native.neural import bent
@@ -66,7 +67,9 @@ def reader(program: Program, model: str, *, arrays: str = "npz") -> str:
     wanted += [f"output_{program.output}"]
     if program.output in ("log", "relu"):
         wanted += ["mask"] * any(head.kind == "mask" for head in program.heads) + ["expm1"]
-    last = {"head": "opacity", "march": "passed", "network": "covered"}.get(program.opacity, "opaque")
+    last = {"head": "opacity", "march": "passed", "network": "covered"}.get(
+        program.opacity, "opaque"
+    )
     wanted += [last, "end"]
     return filled(
         "".join(parts[name] for name in wanted),
@@ -79,17 +82,11 @@ def reader(program: Program, model: str, *, arrays: str = "npz") -> str:
 
 def _curvature(program: Program) -> dict[str, object]:
     """What a reader says of curvature: nothing where rays are straight."""
+    said = words(program)
     if not program.bends:
-        names = ("more", "given", "flat", "safe", "filed")
-        return {**dict.fromkeys(names, ""), "told": "0 * level"}
-    said = {
-        "more": ", curvature",
-        "given": ", curvature=None",
-        "flat": "    curvature = np.zeros(len(uv)) if curvature is None else curvature\n",
-        "safe": ", (curvature, 0)",
-        "filed": ', Q["curvature"] if "curvature" in Q else None',
-        "told": f"curvature / ({CURVATURE_UNIT} + np.abs(curvature))",
-    }
+        return {**said, "safe": "", "told": "0 * level"}
+    said["safe"] = ", (curvature, 0)"
+    said["told"] = f"curvature / ({CURVATURE_UNIT} + np.abs(curvature))"
     if not isinstance(program.depth, Heights):
         return said
     low, high = bent.sharpest(program.depth)

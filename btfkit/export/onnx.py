@@ -12,20 +12,31 @@ from numpy.typing import NDArray
 
 from btfkit import jsonvalues
 from btfkit.conventions import (
+    CURVATURE_UNIT,
     EPSILON,
     LEAK,
     LEVELS_UNIT,
-    LOOKS,
     LOWEST_COSINE,
+    LOWEST_SEEN,
     MOST_LOG,
-    STEEPEST,
 )
-from btfkit.export.arrays import narrowed, refuse_bent
+from btfkit.export import rays
+from btfkit.export.arrays import narrowed
+from btfkit.export.curvature import words
 from btfkit.export.graph import IR_VERSION, OPSET, Graph, Value
 from btfkit.export.sections import filled, sections
 from btfkit.materials.base import Material
+from btfkit.native.neural.bent import sharpest
 from btfkit.native.neural.plain import YUV_TO_RGB, bfloat16
-from btfkit.program import Dense, DepthNetwork, Heights, Program, Texture
+from btfkit.program import (
+    Cover,
+    Dense,
+    DepthNetwork,
+    Heights,
+    OffsetNetwork,
+    Program,
+    Texture,
+)
 
 # Names of element types of `onnx.TensorProto`.
 _FLOAT, _DOUBLE, _INT64, _BFLOAT16 = 1, 11, 7, 16
@@ -51,18 +62,16 @@ def write(material: Material, program: Program, folder: Path) -> None:
     onnx.checker.check_model(model)
     onnx.save(model, folder / "material.onnx")
     text = sections("onnx.py.txt")["evaluate.py"]
-    (folder / "evaluate.py").write_text(filled(text, model=material.model))
+    (folder / "evaluate.py").write_text(filled(text, model=material.model, **words(program)))
 
 
 def built(program: Program, *, name: str, about: str) -> Any:
-    """The model of ONNX: uv, light, view, footprint to rgb and opacity.
+    """The model of ONNX: uv, light, view, footprint, curvature where it counts, to rgb, opacity.
 
     Args:
         name: of the graph. about: what the model carries as its metadata.
     """
     from onnx import TensorProto, helper, numpy_helper
-
-    refuse_bent(program, "onnx")
 
     graph = Graph()
     rgb, opacity = _answered(graph, program)
@@ -70,6 +79,7 @@ def built(program: Program, *, name: str, about: str) -> Any:
         graph.nodes.append(helper.make_node("Identity", [value.name], [out]))
     info = helper.make_tensor_value_info
     shapes = {"uv": ["b", 2], "light": ["b", 3], "view": ["b", 3], "footprint": ["b"]}
+    shapes |= {"curvature": ["b"]} if program.bends else {}
     outputs = {"rgb": ["b", len(program.channels)], "opacity": ["b"]}
     made = helper.make_graph(
         graph.nodes,
@@ -92,17 +102,22 @@ def _answered(graph: Graph, program: Program) -> tuple[Value, Value]:
     blur = graph.op("Unsqueeze", footprint, columns)
     light, lit = _unit(graph.input("light"))
     view, seen = _unit(graph.input("view"))
+    bend: Value | None = None
     good = lit & seen & _finite(uv) & _finite(blur)
+    if program.bends:
+        bend = graph.op("Unsqueeze", graph.input("curvature"), columns)
+        good = good & _finite(bend)
     good = good & (view[2:3] < 0.0).of("Not")
     up = graph.array([[0, 0, 1]])
     uv = good.where(uv, 0.0)
     uv = uv - uv.of("Floor") if program.wrap else uv.between(0.0, 1.0)
     light, view = good.where(light, up), good.where(view, up)
-    made = _Evaluation(graph, program, uv, light, view, good.where(blur, 0.5))
+    bend = None if bend is None else good.where(bend, 0.0)
+    made = _Evaluation(graph, program, uv, light, view, good.where(blur, 0.5), bend)
     rgb, opacity = made.answer()
     shown = good & (opacity > 0.0)
-    if not program.full_sphere:
-        shown = shown & (light[2:3] > 0.0)
+    if program.curved or not program.full_sphere:
+        shown = shown & (made.light[2:3] > 0.0)
     rgb = shown.where(rgb, 0.0)
     return rgb, graph.op("Squeeze", good.where(opacity, 0.0), columns)
 
@@ -127,19 +142,29 @@ class _Evaluation:
     """The evaluation of a program, node by node; shapes and order as in its plain twin."""
 
     def __init__(
-        self, graph: Graph, program: Program, uv: Value, light: Value, view: Value, blur: Value
+        self,
+        graph: Graph,
+        program: Program,
+        uv: Value,
+        light: Value,
+        view: Value,
+        blur: Value,
+        bend: Value | None,
     ) -> None:
         self.graph, self.program = graph, program
-        self.uv, self.light, self.view = uv, light, view
+        self.uv, self.light, self.view, self.bend = uv, light, view, bend
         level = view[0:1] * 0.0
         if program.leveled:
             level = (blur.between(0.5, 1e30) * 2.0).of("Log") * (1 / np.log(2))
         self.level = level
+        self.toward, self.away = self._step(view), self._step(light)
+        self.opacity = level * 0.0 + 1.0
+        self.depth = self._marched() if isinstance(program.depth, Heights) else None
         self.known = self._query()
 
     def answer(self) -> tuple[Value, Value]:
         program = self.program
-        depth = self._depth()
+        depth = self._moves()
         values = [self._moved(texture, depth) for texture in program.textures]
         for k in range(program.frames):
             axis = values[0][3 * k : 3 * k + 3]
@@ -153,9 +178,7 @@ class _Evaluation:
             heads[head.kind] = raw[at : at + head.count]
             at += head.count
         rgb = self._reflectance(heads, depth)
-        opacity = self.level * 0.0 + 1.0
-        if "opacity" in heads:
-            opacity = heads["opacity"].of("Sigmoid")
+        opacity = heads["opacity"].of("Sigmoid") if "opacity" in heads else self.opacity
         return rgb, opacity
 
     def _query(self) -> Known:
@@ -170,9 +193,9 @@ class _Evaluation:
         known["cos_diff"] = none.where(0.0, length * 0.5)
         known["level"] = self.level * (1 / LEVELS_UNIT)
         known["curvature"] = self.level * 0.0
-        asked = {*self.program.inputs}
-        if isinstance(self.program.depth, DepthNetwork):
-            asked |= {*self.program.depth.inputs}
+        if self.bend is not None:
+            known["curvature"] = self.bend / (self.bend.of("Abs") + CURVATURE_UNIT)
+        asked = self.program.every_input
         for name, way in (("l", light), ("v", view)):
             if f"{name}x_disc" in asked or f"{name}y_disc" in asked:
                 known |= self._columns((f"{name}x_disc", f"{name}y_disc"), _on_disc(way))
@@ -186,54 +209,46 @@ class _Evaluation:
         flip = self.graph.array([[1, -self.program.aspect]])
         return way[0:2] / way[2:3].at_least(LOWEST_COSINE) * flip
 
-    def _depth(self) -> Value | None:
-        found = self.program.depth
-        if found is None:
-            return None
-        if isinstance(found, Heights):
-            low = self.view[2:3].at_least(STEEPEST)
-            flip = self.graph.array([[1, -self.program.aspect]])
-            along = self.view[0:2] / low * found.scale * flip
-            lift = self.view[2:3].at_least(LOWEST_COSINE) / low * found.scale
-            return self._crossing(found.heights, along) * lift
-        if not isinstance(found, DepthNetwork):
-            raise TypeError(f"{type(found).__name__} has no form in ONNX here")
-        place = self._lookup(found.texture.levels[0], self.uv)
-        known = self.known | self._columns(found.texture.features, place)
-        return self._run(found.layers, found.inputs, known)[0:1] * found.scale
+    def _marched(self) -> Value:
+        """Ray depth through heights; where curvature bends rays, light and view are turned."""
+        program, found = self.program, self.program.depth
+        assert isinstance(found, Heights)
+        parts = (self.graph, found, self._lookup, self.uv, self.view)
+        if not program.curved or self.bend is None:
+            return rays.on_plane(*parts, program.aspect)
+        low, high = sharpest(found)
+        self.bend = self.bend.between(max(low, -1e30), min(high, 1e30))
+        met = rays.on_curved(*parts, self.bend, program.aspect)
+        if found.opacity is None:
+            bends = self.bend.of("Abs") > 0.0
+            flat = (rays.on_plane(*parts, program.aspect), self.opacity, self.level * 0.0)
+            met = rays.Met(*(bends.where(a, b) for a, b in zip(met, flat, strict=True)))
+        light, view = (
+            rays.turned(self.graph, way, self.view, met.turn) for way in (self.light, self.view)
+        )
+        still = (met.turn.of("Abs") > 0.0).of("Not")
+        upright = still.where(view[2:3], view[2:3].at_least(LOWEST_SEEN))
+        self.light, self.view = light, self.graph.joined([view[0:2], upright])
+        self.opacity = met.opacity
+        return met.depth
 
-    def _crossing(self, heights: NDArray[Any], along: Value) -> Value:
-        top, bottom = float(heights.max()), float(heights.min())
-        h, w = heights.shape
-        surface = heights[..., None]
+    def _moves(self) -> Value | None:
+        """What moves lookups: a depth (b, 1), an offset (b, 2); asks the network of opacity."""
+        cover, found = self.program.cover, self.program.depth
+        if cover is not None:
+            number = self._network(cover)[0:1]
+            if cover.kind == "direct":
+                self.opacity = number.of("Sigmoid")
+            else:
+                self.opacity = (self.view[2:3] < number).where(0.0, 1.0)
+        if isinstance(found, DepthNetwork):
+            return self._network(found)[0:1] * found.scale
+        return self._network(found) if isinstance(found, OffsetNetwork) else self.depth
 
-        def above(t: Value) -> Value:
-            return t - self._lookup(surface, self.uv + t * along)
-
-        def met(high: Value, low: Value, gap: Value, under: Value) -> Value:
-            return high + (low - high) * (gap / (gap - under).at_least(1e-12))
-
-        texels = (along.of("Abs") * self.graph.array([[w, h]])).most() * (top - bottom)
-        count = texels.of("Ceil").between(1.0, float(LOOKS))
-        low = high = self.level * 0.0 + top
-        gap = under = above(low)
-        going: Value | None = None
-        for k in range(1, LOOKS + 1):
-            share = (self.level * 0.0 + float(k)) / count
-            to = share.at_most(1.0) * (bottom - top) + top
-            found = above(to)
-            if going is None:
-                low, under, going = to, found, found > 0.0
-                continue
-            high, gap = going.where(low, high), going.where(under, gap)
-            low, under = going.where(to, low), going.where(found, under)
-            going = going & (found > 0.0)
-        first = met(high, low, gap, under)
-        rest = above(first)
-        short = rest > 0.0
-        high, gap = short.where(first, high), short.where(rest, gap)
-        low, under = short.where(low, first), short.where(under, rest)
-        return met(high, low, gap, under)
+    def _network(self, part: Cover | DepthNetwork | OffsetNetwork) -> Value:
+        place = self._lookup(part.texture.levels[0], self.uv)
+        known = self.known | self._columns(part.texture.features, place)
+        return self._run(part.layers, part.inputs, known)
 
     def _lookup(self, texture: NDArray[Any], uv: Value) -> Value:
         """(b, k) bilinear between texel centres."""
@@ -284,10 +299,12 @@ class _Evaluation:
 
     def _moved(self, texture: Texture, depth: Value | None) -> Value:
         uv = self.uv
-        if depth is not None and (texture.view or texture.light):
-            way = self._step(self.view) * texture.view
+        if depth is not None and isinstance(self.program.depth, OffsetNetwork):
+            uv = uv + depth * texture.view if texture.view else uv
+        elif depth is not None and (texture.view or texture.light):
+            way = self.toward * texture.view
             if texture.light:
-                way = way - self._step(self.light) * texture.light
+                way = way - self.away * texture.light
             uv = uv + depth * way
         return self._between(texture, uv)
 
@@ -319,6 +336,8 @@ class _Evaluation:
         program = self.program
         if program.output == "cosine":
             return heads["linear"] * self.light[2:3]
+        if program.output == "linear":
+            return heads["linear"].at_least(0.0)
         if program.output == "released":
             to_rgb = self.graph.array(YUV_TO_RGB.T)
             y = (heads["log"].at_most(MOST_LOG) @ to_rgb).at_most(MOST_LOG)

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.conventions import EPSILON, LEAK, LOOKS, LOWEST_COSINE, STEEPEST
-from btfkit.export.arrays import narrowed, refuse_bent
-from btfkit.export.glsl.code import VECTORS, groups_of, reflectance, sources_of, variable
+from btfkit.export import curvature
+from btfkit.export.arrays import holes, narrowed, textures
+from btfkit.export.glsl.code import VECTORS, groups_of, reflectance, sources_of, told, variable
 from btfkit.export.glsl.layers import Source, Weights, arranged, component, grouped, padded
 from btfkit.export.numbers import literal
 from btfkit.export.sections import filled, sections
-from btfkit.program import Dense, DepthNetwork, Heights, Program, Texture
+from btfkit.program import Cover, Dense, DepthNetwork, Heights, OffsetNetwork, Program, Texture
 
 Array = NDArray[Any]
 Language = Literal["wgsl", "slang"]
@@ -31,36 +32,53 @@ class Shaded:
         buffers: bytes by name, in the order of their bindings: `weights` and `heights` float32,
             `texels`. None is empty.
         half: whether texels are float16, which loses nothing then; else they are float32.
+        starts: by the name of a texture, which texel each of its levels begins with.
     """
 
     text: str
     buffers: dict[str, bytes]
     half: bool
+    starts: dict[str, list[int]]
 
 
-def shaded(program: Program, language: Language, *, model: str) -> Shaded:
-    """The function of a program in a language, and its buffers."""
-    refuse_bent(program, language)
-    return _Writer(program, language).written(model)
+def shaded(
+    program: Program, language: Language, *, model: str, in_textures: bool = False
+) -> Shaded:
+    """The function of a program in a language, and its buffers.
+
+    Args:
+        in_textures: WGSL alone: whether the function is given two textures of 1024 columns, texels
+            and numbers (weights, then heights, four a texel), instead of reading buffers.
+    """
+    return _Writer(program, language, in_textures=in_textures).written(model)
 
 
 class _Writer:
     """Statements of one function, and the numbers that they read."""
 
-    def __init__(self, program: Program, language: Language) -> None:
-        self.program, self.language = program, language
+    def __init__(self, program: Program, language: Language, *, in_textures: bool) -> None:
+        self.program, self.language, self._in_textures = program, language, in_textures
+        self._starts: dict[str, list[int]] = {}
         self.weights = Weights()
         self.texels: list[Array] = []
         self.functions: list[str] = []
         self._at = 0
-        every = [level for texture in _textures(program) for level in texture.levels]
+        every = [level for texture in textures(program) for level in texture.levels]
         self._half = all(narrowed(level).dtype == np.float16 for level in every)
 
     def written(self, model: str) -> Shaded:
         program = self.program
-        body = [*self._depth(), *self._features(), *self._answer()]
+        body = [*self._networks(), *self._features(), *self._answer()]
         parts = sections(f"material.{self.language}.txt")
+        values = {**_values(program, model), **curvature.words(program), **self._curvature()}
+        nothing = "return BtfkitAnswer(value, 1.0)" if self.language == "wgsl" else "return"
+        below = f"  if (!(light{values['in']}.z > 0.0)) {{ {nothing}; }}\n"
+        values["below"] = "" if program.full_sphere else below
         first, last = _chosen(program, half=self._half)
+        if self._in_textures:
+            first[1] = "texel_texture"
+            first[2:2] = ["height_texture"] * isinstance(program.depth, Heights)
+        values |= self._data()
         buffers: dict[str, bytes] = {}
         if self.weights.rows:
             buffers["weights"] = np.asarray(self.weights.rows, "<f4").tobytes()
@@ -72,15 +90,14 @@ class _Writer:
         declared = "".join(
             filled(parts[f"buffer_{name}_half" if name == "texels" and self._half
                          else f"buffer_{name}"], binding=k)
-            for k, name in enumerate(named)
+            for k, name in enumerate(() if self._in_textures else named)
         )  # fmt: skip
-        values = _values(program, model)
         text = filled(parts["start"], **values) + declared
         text += filled("".join(parts[name] for name in first), **values)
         text += "".join(self.functions)
         text += filled("".join(parts[name] for name in last), **values)
         text += "".join(f"  {line}\n" for line in body) + parts["end"]
-        return Shaded(text, buffers, self._half)
+        return Shaded(text, buffers, self._half, self._starts)
 
     # What both languages spell in their own way.
 
@@ -121,6 +138,23 @@ class _Writer:
             lines.append(f"    {case}: {{ return {kind}{place}; }}")
         return "\n".join([*lines, "  }", "}", ""])
 
+    def _weight(self, at: str) -> str:
+        """Four weights."""
+        return f"btfkit_number(numbers, {at})" if self._in_textures else f"btfkit_weights[{at}]"
+
+    def _data(self) -> dict[str, object]:
+        """How functions take textures and give them on: not at all where they read buffers."""
+        kept = self._in_textures
+        found: dict[str, object] = {"height": "btfkit_heights[", "height_end": "]"}
+        if kept:
+            found = {"height": "btfkit_height(numbers, ", "height_end": ")"}
+        for name, parts in (("texels", ("texels",)), ("numbers", ("numbers",)),
+                            ("both", ("texels", "numbers"))):  # fmt: skip
+            found[name] = "".join(f"{part}, " for part in parts) * kept
+            taken = "".join(f"{part}: texture_2d<f32>, " for part in parts)
+            found[f"take_{name}"] = taken * kept
+        return {**found, "first_height": len(self.weights.rows)}
+
     # The evaluation.
 
     def _placed(self, texture: Texture) -> list[str]:
@@ -132,6 +166,7 @@ class _Writer:
             held = np.zeros((h, w, groups * 4), np.float32)
             held[..., :k] = level
             places.append((self._at, w, h))
+            self._starts.setdefault(texture.name, []).append(self._at)
             self.texels.append(held)
             self._at += h * w * groups
         self.functions.append(self._level_function(f"btfkit_level_{name}", places))
@@ -148,7 +183,8 @@ class _Writer:
             lines += [self._made(f"{own}_finer", f"floor({own}_at)", 1)]
             lines += [self._made(f"{own}_share", f"{own}_at - {own}_finer", 1)]
             finer = self._int(f"{own}_finer")
-        look = f"btfkit_lookup(btfkit_level_{own}({{}}), {groups}, {{}}, {own}_uv)"
+        given = "texels, " * self._in_textures
+        look = f"btfkit_lookup({given}btfkit_level_{own}({{}}), {groups}, {{}}, {own}_uv)"
         lines += [self._made(name, look.format(finer, g)) for g, name in enumerate(names)]
         if n > 1:
             lines.append(f"if ({own}_share > 0.0) {{")
@@ -162,33 +198,70 @@ class _Writer:
         lines, found = [], []
         for k, source in enumerate(VECTORS):
             if {*inputs} & {name for name in source.names if name}:
-                text = source.text.replace("vec4(", f"{self._type(4)}(", 1)
+                text = told(source, inputs).replace("vec4(", f"{self._type(4)}(", 1)
                 lines.append(self._made(f"{prefix}{k}", text))
                 found.append(Source(f"{prefix}{k}", source.names))
         return lines, found
 
-    def _depth(self) -> list[str]:
-        found = self.program.depth
-        if not isinstance(found, DepthNetwork):
-            return []
-        looked = self._looked(found.texture, "uv", "0.0")
-        lines, sources = self._vectors(found.inputs, "dq")
-        sources = [*sources_of(found.texture), *sources]
-        some, raw = self._layers("d", found.layers, found.inputs, sources)
-        depth = self._made("depth", f"{raw[0]} * {literal(found.scale)}", 1)
-        return [*looked, *lines, *some, depth]
+    def _networks(self) -> list[str]:
+        """Opacity, and depth or offset, where networks of their own say them."""
+        wgsl, found = self.language == "wgsl", []
+        for part in self.program.networks:
+            name = "c" if isinstance(part, Cover) else "d"
+            looked = self._looked(part.texture, "uv", "0.0")
+            lines, sources = self._vectors(part.inputs, f"{name}q")
+            sources = [*sources_of(part.texture), *sources]
+            some, raw = self._layers(name, part.layers, part.inputs, sources)
+            found += [*looked, *lines, *some]
+            if isinstance(part, DepthNetwork):
+                found.append(self._made("depth", f"{raw[0]} * {literal(part.scale)}", 1))
+            elif isinstance(part, OffsetNetwork):
+                found.append(self._made("offset", f"{self._type(2)}({raw[0]}, {raw[1]})", 2))
+            else:
+                direct = f"btfkit_sigmoid({raw[0]})"
+                seen = self._chosen("1.0", "0.0", f"view.z >= {raw[0]}")
+                found.append(f"opacity = {direct if part.kind == 'direct' else seen};")
+                back = "return BtfkitAnswer(value, 0.0);" if wgsl else "return;"
+                found.append(f"if (!(opacity > 0.0)) {{ {back} }}")
+        return found
 
     def _features(self) -> list[str]:
         program, lines = self.program, []
         for texture in [*program.textures, *([program.scaling] if program.scaling else [])]:
             moves = []
-            if program.depth is not None and texture.view:
-                moves.append(f"{literal(texture.view)} * btfkit_step(view)")
-            if program.depth is not None and texture.light:
-                moves.append(f"{literal(-texture.light)} * btfkit_step(light)")
-            place = f"uv + depth * ({' + '.join(moves)})" if moves else "uv"
+            if isinstance(program.depth, OffsetNetwork):
+                place = f"uv + {literal(texture.view)} * offset" if texture.view else "uv"
+            else:
+                if program.depth is not None and texture.view:
+                    way = "toward" if program.curved else "btfkit_step(view)"
+                    moves.append(f"{literal(texture.view)} * {way}")
+                if program.depth is not None and texture.light:
+                    way = "away" if program.curved else "btfkit_step(light)"
+                    moves.append(f"{literal(-texture.light)} * {way}")
+                place = f"uv + depth * ({' + '.join(moves)})" if moves else "uv"
             lines += self._looked(texture, place, "level")
         return lines
+
+    def _curvature(self) -> dict[str, object]:
+        """What the texts say of curvature; of curved heights their numbers, holes included."""
+        program, wgsl = self.program, self.language == "wgsl"
+        if not program.curved:
+            more = ", curvature: f32" if wgsl else "float curvature, "
+            return {"more": more * program.bends, "in": ""}
+        found, hole = program.depth, ""
+        assert isinstance(found, Heights)
+        for texture in holes(program):
+            self._placed(texture)
+            given = "texels, " * self._in_textures
+            solid = f"btfkit_lookup({given}btfkit_level_{variable(texture)}(0), 1, 0, at).x"
+            hole = curvature.hole(found, solid)
+        more = ", curvature_in: f32" if wgsl else "float curvature, "
+        return {"more": more, "in": "_in", "hole": hole, **curvature.numbers(found)}
+
+    def _chosen(self, yes: str, no: str, when: str) -> str:
+        if self.language == "wgsl":
+            return f"select({no}, {yes}, {when})"
+        return f"{when} ? {yes} : {no}"
 
     def _answer(self) -> list[str]:
         program = self.program
@@ -209,8 +282,7 @@ class _Writer:
         values = reflectance(program, heads)
         if "opacity" in heads:
             lines.append(f"opacity = btfkit_sigmoid({heads['opacity'][0]});")
-            values = [f"select({x}, 0.0, !(opacity > 0.0))" if self.language == "wgsl"
-                      else f"opacity > 0.0 ? {x} : 0.0" for x in values]  # fmt: skip
+            values = [self._chosen(x, "0.0", "opacity > 0.0") for x in values]
         return lines + [f"value[{k}] = {x};" for k, x in enumerate(values)]
 
     def _layers(
@@ -240,8 +312,8 @@ class _Writer:
         kind = "let" if self.language == "wgsl" else "int"
         sums = [f"{kind} k = {at} + (o * {width} + i) * 4;"]
         for c, axis in enumerate("xyzw"):
-            sums.append(f"z += btfkit_weights[k + {c}] * {x}[i].{axis};")
-        lines = [self._made("z", f"btfkit_weights[{bias} + o]"), *self._loop("i", width, sums)]
+            sums.append(f"z += {self._weight(f'k + {c}')} * {x}[i].{axis};")
+        lines = [self._made("z", self._weight(f"{bias} + o")), *self._loop("i", width, sums)]
         value = _activated(layer, "z", f"{x}[o]", rounded=rounded)
         plain = layer.gain is None or layer.centre is None
         lines.append(f"{y}[o] = {value if plain else 'z'};")
@@ -251,17 +323,17 @@ class _Writer:
         # Sums of rows beyond the last output are 0; `mask` keeps them so.
         n, own = literal(len(layer.bias)), f"{y}_"
         mask, gain, centre = (
-            self.weights.place(grouped(part))
+            self._weight(f"{self.weights.place(grouped(part))} + o")
             for part in (np.ones(len(layer.bias)), layer.gain, layer.centre)
         )
         one = self._vec4([1] * 4)
         found += [self._made(f"{own}mean", "0.0", 1), self._made(f"{own}square", "0.0", 1)]
         found += self._loop("o", groups, [f"{own}mean += dot({y}[o], {one}) / {n};"])
-        centred = f"{y}[o] = ({y}[o] - {own}mean * {one}) * btfkit_weights[{mask} + o];"
+        centred = f"{y}[o] = ({y}[o] - {own}mean * {one}) * {mask};"
         found += self._loop("o", groups, [centred, f"{own}square += dot({y}[o], {y}[o]) / {n};"])
         scale = f"1.0 / sqrt({own}square + {literal(EPSILON)})"
         found.append(self._made(f"{own}scale", scale, 1))
-        normal = f"{y}[o] * {own}scale * btfkit_weights[{gain} + o] + btfkit_weights[{centre} + o]"
+        normal = f"{y}[o] * {own}scale * {gain} + {centre}"
         last = _activated(layer, "z", f"{x}[o]", rounded=rounded)
         return found + self._loop("o", groups, [self._made("z", normal), f"{y}[o] = {last};"])
 
@@ -274,35 +346,29 @@ def _activated(layer: Dense, z: str, before: str, *, rounded: bool) -> str:
     return f"{before} + {value}" if layer.residual else value
 
 
-def _textures(program: Program) -> list[Texture]:
-    depth = [program.depth.texture] if isinstance(program.depth, DepthNetwork) else []
-    return [*depth, *program.textures, *([program.scaling] if program.scaling else [])]
-
-
 def _chosen(program: Program, *, half: bool) -> tuple[list[str], list[str]]:
     """Sections before the functions of textures, and after them, that the program needs."""
-    depth, inputs = program.depth, {*program.inputs}
-    every = [*program.layers]
-    if isinstance(depth, DepthNetwork):
-        inputs |= {*depth.inputs}
-        every += depth.layers
+    depth, inputs, every = program.depth, program.every_input, program.every_layer
     marched, disc = isinstance(depth, Heights), any(n.endswith("_disc") for n in inputs)
-    kinds = {head.kind for head in program.heads}
+    covered = program.cover is not None and program.cover.kind == "direct"
+    sigmoid = covered or any(head.kind in ("mask", "opacity") for head in program.heads)
     first = ["cell_wrap" if program.wrap else "cell_clamp"]
     first += ["texel_half" if half else "texel", "lookup"] + ["march"] * marched
-    first += ["rounded"] * program.rounded + ["sigmoid"] * bool(kinds & {"mask", "opacity"})
+    first += ["rounded"] * program.rounded + ["sigmoid"] * sigmoid
     first += [a for a in ("relu", "leaky", "sine") if any(x.activation == a for x in every)]
-    first += ["disc"] * disc + ["step"] * (depth is not None)
+    first += ["disc"] * disc + ["step"] * isinstance(depth, (Heights, DepthNetwork))
     half_ = program.frames > 0 or inputs & {"hx", "hy", "hz", "cos_diff"}
-    last = ["evaluate", "level" if program.leveled else "no_level"] + ["half"] * bool(half_)
-    return first, last + ["march_depth"] * marched
+    curved = program.curved
+    last = ["bent"] * curved + ["evaluate", "level" if program.leveled else "no_level"]
+    last += ["bent_depth"] * curved + ["half"] * bool(half_)
+    return first, last + ["march_depth"] * (marched and not curved)
 
 
 def _values(program: Program, model: str) -> dict[str, object]:
     found: dict[str, object] = {
         "model": model, "channels": len(program.channels), "aspect": literal(program.aspect),
         "lowest": literal(LOWEST_COSINE), "steepest": literal(STEEPEST), "looks": LOOKS,
-        "leak": literal(LEAK), "lit": "true" if program.full_sphere else "light.z > 0.0",
+        "leak": literal(LEAK),
         "reduced": "uv_in - floor(uv_in)" if program.wrap else "saturate(uv_in)",
     }  # fmt: skip
     if isinstance(program.depth, Heights):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from btfkit.export import lobes
+from btfkit.export.curvature import words
 from btfkit.export.sections import filled, sections
 from btfkit.export.shading import shaded
 from btfkit.materials.base import Material
@@ -17,8 +19,12 @@ def write(material: Material, program: Program, folder: Path) -> None:
     for name, data in made.buffers.items():
         (folder / f"{name}.bin").write_bytes(data)
     parts, c, n = sections("material.slang.txt"), len(program.channels), len(made.buffers)
-    entry = filled(parts["compute"], queries=n, answers=n + 1, row=c + 1, channels=c)
+    entry = filled(
+        parts["compute"], queries=n, answers=n + 1, row=c + 1, channels=c,
+        tenth=", queries[q + 9]" * program.bends, **words(program),
+    )  # fmt: skip
     (folder / "example.slang").write_text(entry)
+    (folder / "lobes.slang").write_text(lobes.shader(material, "slang", binding=n + 2))
     # Texels of four half floats are two numbers of four bytes.
     sizes = {"weights": 4, "texels": 2 if made.half else 4, "heights": 1}
     example = filled(
@@ -27,5 +33,6 @@ def write(material: Material, program: Program, folder: Path) -> None:
         channels=c,
         order=", ".join(made.buffers),
         buffers=repr({name: sizes[name] for name in made.buffers}),
+        **words(program),
     )
     (folder / "evaluate.py").write_text(example)

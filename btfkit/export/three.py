@@ -1,4 +1,7 @@
-"""`three`: a JSON and its numbers for three.js, a module that reads them, and a page."""
+"""`three`: a JSON and its numbers for three.js, a module that reads them, and a page.
+
+As a shader of WebGLRenderer (GLSL), and as a node material of WebGPURenderer (TSL around WGSL).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from btfkit.export.glsl import drawable, rgb
+from btfkit.export.glsl.atlas import atlas, quantised
 from btfkit.export.sections import filled, sections
+from btfkit.export.shading import shaded
 from btfkit.materials.base import Material
 from btfkit.program import Program
 
@@ -19,10 +24,14 @@ THREE = "0.187.0"
 def write(material: Material, program: Program, folder: Path) -> None:
     """`material.json`, `material.bin`, `btfkit.js`, `index.html`, `package.json`, `check.mjs`."""
     made = drawable(program, model=material.model)
+    # Of the textures that the file holds, so that both shaders answer alike.
+    near = shaded(quantised(program, "half"), "wgsl", model=material.model, in_textures=True)
+    starts = [start for name in atlas(program, "half").places for start in near.starts[name]]
     h, w = program.grid
     parts: dict[str, Any] = {}
     at = 0
-    for name, data in made.data.items():
+    held = made.data | {"numbers": near.buffers.get("weights", b"")}
+    for name, data in held.items():
         parts[name] = [at, len(data)]
         at += len(data)
     texel = material.header.texel_mm
@@ -35,10 +44,13 @@ def write(material: Material, program: Program, folder: Path) -> None:
         "textures": made.about,
         "parts": parts,
         "rgb": rgb(program.channels),
+        "bends": program.bends,
+        "passes": program.opacity != "none",
         "source": made.source,
+        "wgsl": {"source": near.text, "starts": starts},
     }
     (folder / "material.json").write_text(json.dumps(described) + "\n")
-    (folder / "material.bin").write_bytes(b"".join(made.data.values()))
+    (folder / "material.bin").write_bytes(b"".join(held.values()))
     package = {
         "name": "btfkit-material",
         "private": True,

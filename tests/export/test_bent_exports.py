@@ -10,10 +10,14 @@ import sys
 import warnings
 from pathlib import Path
 
+import needs
 import numpy as np
 import pytest
 from cases import BENT, directions, made
+from test_buffers import device, example
+from test_onnx import session
 
+from btfkit.export import slang, wgsl
 from btfkit.export.glsl import drawable, encoded
 from btfkit.export.glsl.atlas import quantised
 from btfkit.export.package import export
@@ -23,6 +27,7 @@ from btfkit.materials.sbtf.paper import SBTFPaper
 from btfkit.native.neural import plain
 from btfkit.queries import Response
 
+__all__ = ["device"]
 COMPILER = shutil.which("g++") or shutil.which("c++")
 every_case = pytest.mark.parametrize("name", list(BENT))
 Asked = dict[str, np.ndarray]
@@ -118,6 +123,34 @@ def test_the_header_follows_bent_rays(name: str, tmp_path: Path) -> None:
     agree(answers[:, :-1], answers[:, -1], wanted(material, queries), rows)
 
 
+@every_case
+@pytest.mark.slow
+def test_wgsl_follows_bent_rays(name: str, device: None, tmp_path: Path) -> None:
+    material, queries = made(name), asked()
+    wgsl.write(material, material.program(), tmp_path)
+    rgb, opacity = example(tmp_path).evaluate(**queries)
+    agree(rgb, opacity, wanted(material, queries), settled(material, queries))
+
+
+@pytest.mark.parametrize("name", ["sbtf with holes", "sbtf-paper"])
+@pytest.mark.slow
+@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler: apt-get install g++")
+def test_slang_follows_bent_rays(name: str, tmp_path: Path) -> None:
+    needs.module("slangpy")
+    material, queries = made(name), asked()
+    slang.write(material, material.program(), tmp_path)
+    rgb, opacity = example(tmp_path).evaluate(**queries)
+    agree(rgb, opacity, wanted(material, queries), settled(material, queries))
+
+
+@every_case
+@pytest.mark.slow
+def test_a_graph_follows_bent_rays(name: str) -> None:
+    material, queries = made(name), asked()
+    rgb, opacity = session(material.program()).run(None, queries)
+    agree(rgb, opacity, wanted(material, queries), settled(material, queries))
+
+
 @pytest.mark.parametrize("name", ["sbtf with holes", "sbtf-paper"])
 def test_a_scene_of_blender_has_no_form_for_them(name: str, tmp_path: Path) -> None:
     with pytest.raises(TypeError, match="which OSL is not written for"):
@@ -158,9 +191,7 @@ def test_the_shader_follows_bent_rays(tmp_path: Path) -> None:
         material = made(name)
         near = quantised(material.program(), "half")
         uv, view, bend = reduced(material, queries)
-        rgb, opacity = plain.answer(
-            near, uv, queries["light"], view, queries["footprint"], bend
-        )
+        rgb, opacity = plain.answer(near, uv, queries["light"], view, queries["footprint"], bend)
         rows = settled(material, queries)
         same = np.abs(found[:, 3] - opacity) < 1e-5
         assert same[rows].mean() > 0.995

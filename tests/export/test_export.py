@@ -20,19 +20,18 @@ from cases import GRID, SPECS, directions, made
 
 from btfkit.cli import btfkit
 from btfkit.cli.outcome import run
-from btfkit.export import ASKED, TARGETS, blender, exr, npz, three
+from btfkit.export import ASKED, TARGETS, blender, exr, npz
 from btfkit.export.arrays import named, narrowed
 from btfkit.export.glsl.atlas import atlas, quantised
 from btfkit.export.package import export
 from btfkit.export.sections import filled
-from btfkit.export.shading import shaded
 from btfkit.io.images.exr import read_exr
 from btfkit.materials.base import Header, Material
 from btfkit.materials.file import save
 from btfkit.materials.lambert import Lambert, LambertSpec
 from btfkit.materials.lobes.sampling import seen_at
 from btfkit.materials.measured.interpolation import Interpolation
-from btfkit.program import Dense, Head, Heights, Program, Texture
+from btfkit.program import Dense, Head, Program, Texture
 from btfkit.relief.synth import synth_btf
 from btfkit.view.model import page
 
@@ -261,20 +260,6 @@ def test_what_no_export_knows_is_refused_by_name(tmp_path: Path) -> None:
     btf = synth_btf("knit", size=8, lights="3", views="3", samples=1)
     with pytest.raises(TypeError, match="interpolation blends measured pairs"):
         export(Interpolation.of(btf), "npz", tmp_path / "out")
-    from dataclasses import replace
-
-    from btfkit.export.arrays import refuse_unknown
-
-    curved = Heights(np.zeros((2, 2), np.float32), 0.1, curved=True)
-    bends = replace(material.program(), depth=curved)
-    with pytest.raises(TypeError, match="bends with curvature"):
-        refuse_unknown(bends)
-    for target in ("wgsl", "slang"):
-        with pytest.raises(TypeError, match=f"{target} has no form here for rays that bend"):
-            shaded(bends, target, model="sbtf")
-    with pytest.raises(TypeError, match="three has no form here for rays that bend"):
-        three.write(material, bends, tmp_path)
-    assert not list(tmp_path.iterdir())
     large = Lambert(
         LambertSpec((1, 8200)), {"texture": np.ones((1, 8200, 3), np.float32)}, Header((1, 8200))
     )

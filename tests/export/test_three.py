@@ -32,23 +32,28 @@ pytestmark = pytest.mark.slow
 SIZE = 64
 LIGHT = (0.4, 0.5, 0.8)
 EYE = (0.6, -0.5, 2.2)
-# What a person would write into the page's console: a plane, drawn into a float target. Its
-# corners are those of the picture, so that no rasteriser rounds them.
-_LOOK = """<pre id="out"></pre><script type="module">
+# What a person would write into the page's console: a plane, drawn into a float target, whose rows
+# lie from below. Its corners are those of the picture, so that no rasteriser rounds them. The page
+# counts as loaded once the server has the answer: virtual time does not wait for a WebGPU.
+_LOOK = """<img src="/wait"><script type="module">
 while (!globalThis.view) await new Promise((done) => setTimeout(done, 20));
-const { THREE, renderer, material } = view;
+const { THREE, renderer, material } = view, gpu = !!renderer.isWebGPURenderer;
 const camera = new THREE.PerspectiveCamera(), scene = new THREE.Scene(), [x, y, z] = %(eye)s;
 camera.position.set(x, y, z);
+camera.coordinateSystem = renderer.coordinateSystem;
 const edges = [-1 - x, 1 - x, 1 - y, -1 - y].map((edge) => edge * 0.1 / z);
-camera.projectionMatrix.makePerspective(...edges, 0.1, 10);
+camera.projectionMatrix.makePerspective(...edges, 0.1, 10, camera.coordinateSystem);
 camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
 const geometry = new THREE.PlaneGeometry(2, 2);
 geometry.computeTangents();
 const mesh = new THREE.Mesh(geometry, material);
 scene.add(mesh);
+material.transparent = false;  // opacity as it is, blended with nothing
 material.uniforms.btfkit_light.value.set(%(light)s);
 material.uniforms.btfkit_repeat.value.set(3, 2);
-const target = new THREE.WebGLRenderTarget(%(size)d, %(size)d, { type: THREE.FloatType });
+material.uniforms.btfkit_curvature.value.set(%(bend)s);
+const n = %(size)d, options = { type: THREE.FloatType };
+const target = gpu ? new THREE.RenderTarget(n, n, options) : new THREE.WebGLRenderTarget(n, n, options);
 const found = [];
 for (const footprint of [0.5, -1]) {
   material.uniforms.btfkit_footprint.value = footprint;
@@ -56,13 +61,16 @@ for (const footprint of [0.5, -1]) {
   renderer.setClearColor(0, 0);
   renderer.clear();
   renderer.render(scene, camera);
-  const pixels = new Float32Array(4 * %(size)d ** 2);
-  renderer.readRenderTargetPixels(target, 0, 0, %(size)d, %(size)d, pixels);
+  const pixels = new Float32Array(4 * n * n);
+  if (gpu) pixels.set(await renderer.readRenderTargetPixelsAsync(target, 0, 0, n, n));
+  else renderer.readRenderTargetPixels(target, 0, 0, n, n, pixels);
+  const rows = Array.from({ length: n }, (_, k) => pixels.subarray(4 * n * k, 4 * n * (k + 1)));
   let text = "";
-  for (const byte of new Uint8Array(pixels.buffer)) text += String.fromCharCode(byte);
+  for (const row of gpu ? rows.reverse() : rows)
+    for (const byte of new Uint8Array(row.slice().buffer)) text += String.fromCharCode(byte);
   found.push(btoa(text));
 }
-document.getElementById("out").textContent = found.join();
+await fetch("/", { method: "POST", body: found.join() });
 </script>"""
 
 
@@ -85,18 +93,44 @@ def modules() -> Path:
     return kept / "node_modules"
 
 
-@contextmanager
-def served(folder: Path) -> Iterator[str]:
-    """The address of a folder that is served to this machine alone."""
+class Served:
+    """A folder that is served to this machine alone.
 
+    Attributes:
+        address: of it. said: what a page last sent; `/wait` is answered once it did.
+    """
+
+    def __init__(self, address: str) -> None:
+        self.address, self.said, self.done = address, "", threading.Event()
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[Served]:
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *_: Any) -> None:
             pass
 
+        def do_GET(self) -> None:
+            if self.path == "/wait":
+                found.done.wait(60)
+                self._nothing()
+            else:
+                super().do_GET()
+
+        def do_POST(self) -> None:
+            found.said = self.rfile.read(int(self.headers["Content-Length"])).decode()
+            found.done.set()
+            self._nothing()
+
+        def _nothing(self) -> None:
+            self.send_response(204)
+            self.end_headers()
+
     handler = partial(Quiet, directory=str(folder))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        found = Served(f"http://127.0.0.1:{server.server_port}")
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
+        yield found
         server.shutdown()
 
 
@@ -141,8 +175,10 @@ def test_the_page_shows_a_ball_and_says_nothing_in_the_console(
 ) -> None:
     # A picture of the page resizes its window, so that this is what it shows after that, too.
     picture = tmp_path / "seen.png"
-    with served(exported("neumip", modules, tmp_path / "out")) as address:
-        seen = browser.screenshot(f"{address}/", picture, (400, 300), "--virtual-time-budget=4000")
+    with served(exported("neumip", modules, tmp_path / "out")) as at:
+        seen = browser.screenshot(
+            f"{at.address}/", picture, (400, 300), "--virtual-time-budget=4000"
+        )
     assert seen.errors == []
     drawn = cv2.imread(str(picture)).astype(int)
     assert drawn.shape == (300, 400, 3)
@@ -159,31 +195,50 @@ def test_the_page_shows_a_ball_and_says_nothing_in_the_console(
     assert drawn[245:250, 132:137].max() == 0
 
 
+BEND = (40.0, 15.0, -25.0)
+
+
 @pytest.mark.browser
-@pytest.mark.parametrize("name", ["neumip", "neumip-paper"])
-def test_the_page_draws_what_the_material_answers(name: str, modules: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "webgpu"),
+    [("neumip", False), ("neumip", True), ("neumip-paper", False), ("sbtf", False), ("sbtf with holes", True), ("sbtf-paper", True)],
+)  # fmt: skip
+def test_the_page_draws_what_the_material_answers(
+    name: str, webgpu: bool, modules: Path, tmp_path: Path
+) -> None:
     out = exported(name, modules, tmp_path / "out")
     page = out / "index.html"
     assert len(page.read_text().splitlines()) <= 40
     assert not re.search(r"https?://", page.read_text() + (out / "btfkit.js").read_text())
-    values = {"eye": list(EYE), "light": ", ".join(map(str, LIGHT)), "size": SIZE}
+    values = {
+        "eye": list(EYE), "light": ", ".join(map(str, LIGHT)), "size": SIZE,
+        "bend": ", ".join(map(str, BEND)),
+    }  # fmt: skip
     (out / "look.html").write_text(page.read_text() + _LOOK % values)
-    with served(out) as address:
-        seen = browser.load(f"{address}/look.html", "--virtual-time-budget=8000")
+    with served(out) as at:
+        seen = browser.load(f"{at.address}/look.html{'?webgpu' * webgpu}", webgpu=webgpu)
     assert seen.errors == []
     place, view = rays()
     uv = np.stack([place[..., 0] + 1, 1 - place[..., 1]], axis=-1) / 2 * [3, 2]
     light = np.broadcast_to(np.array(LIGHT) / np.linalg.norm(LIGHT), view.shape)
-    program = quantised(made(name).program(), "half")
-    asked = [np.float32(part).reshape(SIZE**2, -1) for part in (uv - np.floor(uv), light, view)]
+    material = made(name)
+    program = quantised(material.program(), "half")
+    uv = uv - np.floor(uv) if program.wrap else np.clip(uv, 0, 1)
+    asked = [np.float32(part).reshape(SIZE**2, -1) for part in (uv, light, view)]
+    x, y = asked[2][:, 0], asked[2][:, 1]
+    bend = (BEND[0] * x * x + 2 * BEND[1] * x * y + BEND[2] * y * y) / (x * x + y * y)
+    bend = bend.clip(*getattr(material, "sharpest", (-np.inf, np.inf))).astype(np.float32)
     step = np.array([3, 2]) / SIZE * program.grid[::-1]
     for text, footprint in zip(
-        seen.text("out").split(","), (0.5, 0.5 * np.sqrt((step**2).sum() / 2)), strict=True
+        at.said.split(","), (0.5, 0.5 * np.sqrt((step**2).sum() / 2)), strict=True
     ):
         found = np.frombuffer(base64.b64decode(text), "<f4").reshape(SIZE**2, 4)
         blur = np.full(SIZE**2, footprint, np.float32)
-        wanted, opacity = plain.answer(program, *asked, blur)
+        curvature = bend if program.bends else None
+        wanted, opacity = plain.answer(program, *asked, blur, curvature)
         error = np.abs(found[:, :3] - wanted) / np.maximum(1, np.abs(wanted))
         assert wanted.std() > 0.01
         assert np.mean(error <= 2e-4) >= 0.999
-        np.testing.assert_allclose(found[:, 3], opacity, atol=1e-6)
+        assert np.mean(np.abs(found[:, 3] - opacity) <= 1e-6) >= 0.999
+        if program.opacity != "none":
+            assert np.mean(opacity == 0) > 0.002

@@ -401,8 +401,21 @@ def test_a_dropped_mesh_shows_what_the_renderer_draws_of_it(tmp_path: Path) -> N
     assert np.mean(np.abs(found - wanted) > 2e-4 * np.maximum(1, np.abs(wanted))) <= 1e-3
 
 
-def test_rays_bend_on_the_page_as_the_model_bends_them(tmp_path: Path) -> None:
-    material = made("sbtf")
+def on_edges(program: Any, uv: Any, *query: Any, step: float = 1e-6) -> np.ndarray:
+    """Whether an answer (b,) jumps where its place moves by what float32 rounds of it."""
+    wide = program.in_dtype(np.float64)
+    parts = [np.asarray(part, np.float64) for part in query]
+    found = []
+    for du, dv in ((0, 0), (step, step), (-step, step), (step, -step), (-step, -step)):
+        rgb, opacity = plain.answer(wide, np.asarray(uv, np.float64) + [du, dv], *parts)
+        found.append(np.column_stack([np.log1p(rgb), opacity]))
+    # Between texels that differ by 1, 36 a tile wide, a place moves an answer by 1e-4.
+    return np.ptp(found, axis=0).max(axis=1) > 1e-3
+
+
+@pytest.mark.parametrize("name", ["sbtf", "sbtf with holes", "sbtf-paper"])
+def test_rays_bend_on_the_page_as_the_model_bends_them(name: str, tmp_path: Path) -> None:
+    material = made(name)
     near = quantised(material.program(), "half")
     script = f"""{ENCODE}
       return {json.dumps(states(repeat=6))}.map((state) => {{
@@ -439,10 +452,12 @@ def test_rays_bend_on_the_page_as_the_model_bends_them(tmp_path: Path) -> None:
             assert np.abs(told).max() > 0.1
         lit = hit & (light[:, 3] == 0)
         ways = light[lit, :3] / np.linalg.norm(light[lit, :3], axis=1, keepdims=True)
-        wanted, opacity = plain.answer(
-            near, where[lit, :2], ways, view[lit, :3], where[lit, 2], bend[lit, 0]
-        )
-        gap = np.abs(said[lit, :3] - wanted).max(axis=1)
-        # float32 there and here: the rest lies on edges of the march, where opacity parts too.
-        assert np.mean(gap > 2e-4 * np.maximum(1, wanted.max(axis=1))) <= 5e-3
-        assert np.mean((said[lit, 3] > 0.5) != (opacity > 0.5)) <= 5e-3
+        asked = where[lit, :2], ways, view[lit, :3], where[lit, 2], bend[lit, 0]
+        wanted, opacity = plain.answer(near, *asked)
+        gap = np.abs(said[lit, :3] - wanted).max(axis=1) / np.maximum(1, wanted.max(axis=1))
+        off = (gap > 2e-4) | ((said[lit, 3] > 0.5) != (opacity > 0.5))
+        edge = on_edges(near, *asked)
+        assert off.mean() <= 1e-3
+        assert edge.mean() <= 0.02
+        # Those that are off lie on edges of what is seen.
+        assert not (off & ~edge).any()

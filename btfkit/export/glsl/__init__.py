@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from btfkit.export import lobes
 from btfkit.export.glsl.atlas import Texels, atlas
 from btfkit.export.glsl.code import shader
 from btfkit.export.numbers import literal
@@ -54,6 +55,7 @@ def write(material: Material, program: Program, folder: Path) -> None:
     """`material.glsl`, `material.json`, its textures, `upload.js` and `example.html`."""
     made = drawable(program, model=material.model)
     (folder / "material.glsl").write_text(made.source)
+    (folder / "lobes.glsl").write_text(lobes.shader(material, "glsl"))
     (folder / "material.json").write_text(json.dumps(made.about) + "\n")
     for name, data in made.data.items():
         (folder / f"{name}.bin").write_bytes(data)

@@ -10,24 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.conventions import (
-    CURVATURE_UNIT,
-    CURVED_FINER,
     LEVELS_UNIT,
     LOOKS,
     LOWEST_COSINE,
-    LOWEST_SEEN,
-    MOST_BEND,
     MOST_LOG,
-    SLACK,
     STEEPEST,
 )
-from btfkit.export.arrays import textures
+from btfkit.export import curvature
+from btfkit.export.arrays import holes, textures
 from btfkit.export.glsl import layers
 from btfkit.export.glsl.atlas import Atlas
 from btfkit.export.glsl.layers import Source, Weights, vec4
 from btfkit.export.numbers import literal
 from btfkit.export.sections import filled, sections
-from btfkit.native.neural import bent
 from btfkit.native.neural.plain import YUV_TO_RGB
 from btfkit.program import Cover, DepthNetwork, Heights, OffsetNetwork, Program, Texture
 
@@ -114,28 +109,15 @@ def _values(program: Program, model: str) -> dict[str, object]:
 
 
 def _curvature(program: Program) -> dict[str, object]:
-    """What a shader says of curvature: nothing where rays are straight."""
+    """What a shader says of curvature: nothing where answers do not depend on it."""
     found, more = program.depth, "float curvature, " * program.bends
     if not (isinstance(found, Heights) and found.curved):
         return {"more": more}
-    near = replace(found, heights=found.heights.astype(np.float16).astype(np.float32))
-    top, bottom = max(float(near.heights.max()), 0.0), min(float(near.heights.min()), 0.0)
-    low, high = bent.sharpest(near)
-    reach, name = literal(bent.hole_range(near)), variable(Texture("opacity", ()))
-    hole = (
-        f"  vec4 solid;\n  btfkit_look_{name}(at, 0.0, solid);\n"
-        f"  gap = max(gap - {literal(SLACK * bent.hole_range(near))}, (0.5 - solid.x) * {reach});\n"
-    )
-    return {
-        "more": more,
-        "hole": hole if found.opacity is not None else "",
-        "holes": "true" if found.opacity is not None else "false",
-        "least_bend": literal(-MOST_BEND / max(top, 1e-6)),
-        "most_bend": literal(MOST_BEND / max(-bottom, 1e-6)),
-        "surface": literal(top), "bottom": literal(bottom),
-        "flattest": literal(max(low, -1e30)), "sharpest": literal(min(high, 1e30)),
-        "finer": literal(CURVED_FINER), "more_looks": found.looks, "seen": literal(LOWEST_SEEN),
-    }  # fmt: skip
+    near, text = replace(found, heights=found.heights.astype(np.float16).astype(np.float32)), ""
+    for texture in holes(program):
+        text = f"  vec4 solid;\n  btfkit_look_{variable(texture)}(at, 0.0, solid);\n"
+        text += curvature.hole(near, "solid.x")
+    return {"more": more, "hole": text, **curvature.numbers(near)}
 
 
 def _look(texture: Texture, atlas: Atlas) -> str:
@@ -206,16 +188,19 @@ def _called(texture: Texture, place: str, level: str) -> list[str]:
     ]
 
 
+def told(source: Source, inputs: Iterable[str]) -> str:
+    """Text of one of `VECTORS`, with the curvature where it is asked for."""
+    if "curvature" not in source.names or "curvature" not in inputs:
+        return source.text
+    return source.text.replace("0.0, 0.0, 0.0)", f"{curvature.softened()}, 0.0, 0.0)")
+
+
 def _vectors(inputs: Iterable[str], prefix: str) -> tuple[list[str], list[Source]]:
     """Variables for the vectors that inputs are taken from."""
     wanted, lines, found = set(inputs), [], []
     for k, source in enumerate(VECTORS):
         if wanted & {name for name in source.names if name}:
-            text = source.text
-            if "curvature" in wanted and "curvature" in source.names:
-                bend = f"curvature / (abs(curvature) + {literal(CURVATURE_UNIT)})"
-                text = text.replace("0.0, 0.0, 0.0)", f"{bend}, 0.0, 0.0)")
-            lines.append(f"vec4 {prefix}{k} = {text};")
+            lines.append(f"vec4 {prefix}{k} = {told(source, inputs)};")
             found.append(Source(f"{prefix}{k}", source.names))
     return lines, found
 
