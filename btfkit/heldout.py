@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -39,8 +40,16 @@ def split(count: int, holdout: float = 0.05, seed: int = 0) -> tuple[Index, Inde
     held = 0 if holdout == 0 or count == 1 else max(1, round(holdout * count))
     if held >= count:
         raise ValueError(f"holdout = {holdout} of {count} leaves nothing to train on")
-    order = np.random.default_rng([seed, 0x5EED]).permutation(count)
-    return np.sort(order[held:]), np.sort(order[:held])
+    train, test = _split(count, held, seed)
+    return train.copy(), test.copy()
+
+
+# A fit asks for one and the same split of its millions of rows from several places.
+@lru_cache(maxsize=1)
+def _split(count: int, held: int, seed: int) -> tuple[Index, Index]:
+    tested = np.zeros(count, bool)
+    tested[np.random.default_rng([seed, 0x5EED]).permutation(count)[:held]] = True
+    return np.flatnonzero(~tested), np.flatnonzero(tested)
 
 
 def fingerprint(source: BTF | QuerySet) -> dict[str, Any]:
@@ -62,7 +71,7 @@ def fingerprint(source: BTF | QuerySet) -> dict[str, Any]:
         parts = [_rounded(source.texture(int(pair))) for pair in chosen]
         of = f"textures {', '.join(map(str, chosen))}"
     for part in parts:
-        digest.update(b"none" if part is None else np.ascontiguousarray(part).tobytes())
+        digest.update(b"none" if part is None else np.ascontiguousarray(part).data)
     return {"sha256": digest.hexdigest(), "of": of}
 
 

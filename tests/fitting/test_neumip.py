@@ -278,6 +278,17 @@ def test_group_25_quantised_textures_stay_close():
 # --- what it is trained on --------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("count", [1, 7, 4096])
+def test_most_queries_are_sharp_and_a_coarser_level_never_has_more_than_a_finer_one(count: int):
+    found = data.shares_of(count, 8)
+    assert sum(found) == count
+    assert found[0] >= 0.6 * count
+    assert data.shares_of(count, 1) == [count]
+    if count == 4096:
+        assert sorted(found, reverse=True) == found
+        assert found[-1] > 0
+
+
 def test_coarse_batches_are_the_textures_blurred_by_the_contract():
     btf = bumps(n=6, h=16, w=24)
     source = data.TexelSource(btf, np.arange(6), np.arange(0), levels=4, seed=1,

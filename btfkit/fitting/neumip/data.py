@@ -1,4 +1,4 @@
-"""What NeuMIP is trained on: random texels of a bounded pool of textures, or rows of queries."""
+"""What NeuMIP is trained on: batches of queries with answers, here random texels of textures."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit import directions
 from btfkit.btf import BTF
-from btfkit.errors import FitError
 from btfkit.fitting.neumip.levels import Level, coarser
 from btfkit.fitting.pool import Pool
 from btfkit.fitting.prior.pairs import Guesses
 from btfkit.native.draw import Draw, Images, draw
 from btfkit.native.neural.layout import Array
-from btfkit.queries import QuerySet
 
 Progress = Callable[[int, int], None]
-_HELD_TEXELS = 2048
-_HELD_PAIRS = 16
+HELD_TEXELS = 2048
+# Share of a batch that is sharp, and how many queries a level has of what the one before has.
+# docs/neumip.md, levels of detail: a sharp texture of glints needs most of the queries.
+_SHARP, _FEWER = 0.6, 0.7
+HELD_PAIRS = 16
 
 
 @final
@@ -60,6 +60,15 @@ class Share:
     seed: int
     start: int
     stop: int
+
+
+def shares_of(count: int, levels: int) -> list[int]:
+    """How many queries of a batch each level of detail has, the sharp one first."""
+    if levels == 1:
+        return [count]
+    parts = _FEWER ** np.arange(levels - 1)
+    edges = (count * (1 - _SHARP) * np.cumsum(parts) / parts.sum()).astype(int)
+    return [count - int(edges[-1]), *np.diff(edges, prepend=0).tolist()]
 
 
 class Source(ABC):
@@ -138,12 +147,11 @@ class TexelSource(Source):
     def shares(self, step: int, count: int) -> list[Share]:
         """What a batch is drawn from: the sharp textures last."""
         self._pool.at_step(step)
-        # Half of the queries are sharp; every further level has a quarter of the texels.
         at, found = count, []
         seed = int(np.random.SeedSequence([self._seed, step]).generate_state(1, np.uint64)[0])
         seed >>= 1  # room for one number a query
-        for level, (images, blur, pairs) in enumerate(self._coarse):
-            share = max(at // 2, 1) if level == 0 else max(at // 3, 1)
+        coarse = zip(self._coarse, shares_of(count, len(self._coarse) + 1)[1:], strict=True)
+        for level, ((images, blur, pairs), share) in enumerate(coarse):
             mixed = seed ^ (level + 1) << 40
             if self._guesses:
                 guess, its_blur = self._guesses.coarse[level]
@@ -160,11 +168,11 @@ class TexelSource(Source):
 
     def held_out(self) -> Batch:
         rng = np.random.default_rng([self._seed, 7])
-        pairs = rng.permutation(self._test)[:_HELD_PAIRS]
+        pairs = rng.permutation(self._test)[:HELD_PAIRS]
         h, w = self._btf.shape[1:3]
         parts = []
         for pair in pairs:
-            texel = rng.integers(h * w, size=min(_HELD_TEXELS, h * w))
+            texel = rng.integers(h * w, size=min(HELD_TEXELS, h * w))
             row, col = np.divmod(texel, w)
             uv = np.stack([(col + 0.5) / w, (row + 0.5) / h], axis=1).astype(np.float32)
             light = self._btf.light_at(int(pair))[row, col]
@@ -207,102 +215,6 @@ class TexelSource(Source):
         return images, level.blur, pairs
 
 
-@final
-class RowSource(Source):
-    """Rows of a query file with their own footprints, in one shuffled order.
-
-    Args:
-        curved: whether curvature and opacity count: what is not seen, having an opacity below
-            1/2, is no measurement.
-    """
-
-    def __init__(
-        self,
-        queries: QuerySet,
-        train: NDArray[np.intp],
-        test: NDArray[np.intp],
-        *,
-        seed: int,
-        curved: bool = False,
-    ) -> None:
-        if queries.rgb is None:
-            raise FitError("these queries have no answers (no rgb): there is nothing to fit")
-        usable = queries.valid()
-        train = train[usable[train]]
-        self.masked = int(len(queries) - usable.sum())
-        if not len(train):
-            raise FitError(f"none of {len(queries)} queries is finite and seen from above")
-        rng = np.random.default_rng([seed, 11])
-        # A batch is a run of rows of this order: no gathering while training.
-        self._rows = _rows(queries, rng.permutation(train), curved=curved)
-        held = test[usable[test]]
-        few = rng.permutation(held)[: _HELD_PAIRS * _HELD_TEXELS]
-        self._held = _rows(queries, few, curved=curved)
-        self._seed = seed
-
-    def batch(self, step: int, count: int) -> Batch:
-        rows, have = self._rows, len(self._rows)
-        if count >= have:
-            return rows
-        # Every epoch begins elsewhere, so that the same rows do not always meet.
-        a_epoch = have // count
-        epoch, turn = divmod(step, a_epoch)
-        rest = have - a_epoch * count
-        first = np.random.default_rng([self._seed, epoch]).integers(rest + 1) + turn * count
-        cut = slice(int(first), int(first) + count)
-        return _cut(rows, cut)
-
-    def held_out(self) -> Batch:
-        return self._held
-
-
-def _rows(queries: QuerySet, rows: NDArray[np.intp], *, curved: bool) -> Batch:
-    assert queries.rgb is not None
-    unit = (directions.normalize(d[rows]).astype(np.float32) for d in (queries.light, queries.view))
-    footprint = None if queries.footprint is None else queries.footprint[rows]
-    weight = None if queries.weight is None else queries.weight[rows]
-    light, view = unit
-    target, bend = queries.rgb[rows], None
-    if curved:
-        if queries.opacity is not None:
-            target = np.where(queries.opacity[rows, None] < 0.5, np.float32(np.nan), target)
-        if queries.curvature is not None and queries.curvature.any():
-            bend = queries.curvature[rows]
-    return Batch(queries.uv[rows], light, view, footprint, target, weight, bend, rows)
-
-
-def _cut(rows: Batch, at: slice) -> Batch:
-    footprint = None if rows.footprint is None else rows.footprint[at]
-    weight = None if rows.weight is None else rows.weight[at]
-    bend = None if rows.curvature is None else rows.curvature[at]
-    place = None if rows.rows is None else rows.rows[at]
-    view, target = rows.view[at], rows.target[at]
-    return Batch(rows.uv[at], rows.light[at], view, footprint, target, weight, bend, place)
-
-
 def _nothing(channels: int) -> Batch:
     arrays = [np.empty((0, size), np.float32) for size in (2, 3, 3, channels)]
     return Batch(arrays[0], arrays[1], arrays[2], None, arrays[3])
-
-
-def source_of(
-    data: BTF | QuerySet,
-    train: NDArray[np.intp],
-    test: NDArray[np.intp],
-    *,
-    levels: int,
-    curved: bool,
-    seed: int,
-    pool_bytes: int,
-    progress: Progress | None = None,
-) -> Source:
-    """Where batches of a BTF or of queries come from.
-
-    Args:
-        levels: of a BTF's textures that are drawn from. curved: whether a query's curvature counts.
-    """
-    if isinstance(data, BTF):
-        return TexelSource(
-            data, train, test, levels=levels, seed=seed, pool_bytes=pool_bytes, progress=progress
-        )
-    return RowSource(data, train, test, seed=seed, curved=curved)

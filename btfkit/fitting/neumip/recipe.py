@@ -14,7 +14,8 @@ from torch import Tensor
 from btfkit.btf import BTF, Wrap
 from btfkit.errors import FitError
 from btfkit.fitting.loop import Generators, Trainable
-from btfkit.fitting.neumip.data import Batch, Source, TexelSource, source_of
+from btfkit.fitting.neumip.data import Batch, Source, TexelSource
+from btfkit.fitting.neumip.rows import source_of
 from btfkit.fitting.neumip.settings import Shared, refuse_unused
 from btfkit.fitting.prior.pairs import Guesses
 from btfkit.footprint import most_levels
@@ -105,7 +106,7 @@ class Recipe(Trainable, ABC, Generic[S]):
         """Levels of the data's own grid that the model's pyramid reaches to."""
         if self.spec.levels == 1:
             return 1
-        finest = math.ceil(self.layout.banks[0].shift)
+        finest = math.ceil(self.spec.begins(self._header))
         return min(self.spec.levels + finest, most_levels(self._header.grid))
 
     @abstractmethod

@@ -149,6 +149,7 @@ class Settings(Stepped):
         depth: "heights" finds ray depths in a texture of heights, "network" in the offset texture
             and network as published.
         offset_width, offset_activation: of the offset network's hidden layers.
+        finer: levels by which textures are finer than the level that they answer for alone.
         matrix: what a GPU's kernels round the factors of products to: "fp32", "tf32", "bf16" or
             "fp16"; sums are float32.
     """
@@ -158,6 +159,7 @@ class Settings(Stepped):
     depth: str = "heights"
     offset_width: int = 25
     offset_activation: str = "relu"
+    finer: float = 0.5
     matrix: str = "bf16"
 
     def __post_init__(self) -> None:
@@ -165,7 +167,9 @@ class Settings(Stepped):
         _one_of(self, "offset_activation", ("relu", "leaky", "sine"))
         _one_of(self, "depth", ("heights", "network"))
         _one_of(self, "matrix", ("fp32", "tf32", "bf16", "fp16"))
-        for name, low, high in (("offset", 0, 8), ("light", 0, 8), ("offset_width", 1, 128)):
+        for name, low, high in (
+            ("offset", 0, 8), ("light", 0, 8), ("offset_width", 1, 128), ("finer", 0, 1)
+        ):  # fmt: skip
             _within(self, name, low, high)
 
     def sines(self) -> bool:
@@ -183,6 +187,8 @@ class Settings(Stepped):
             reasons |= dict.fromkeys(
                 ("offset_width", "offset_activation"), "depth=heights has none"
             )
+        if self.levels == 1:
+            reasons["finer"] = "levels=1 leaves one texture"
         own = {name: reason for name, reason in reasons.items() if name in given}
         return own | super().unused(given, pictures=pictures)
 

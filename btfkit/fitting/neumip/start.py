@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from btfkit.fitting.prior.guess import Guess, averaged, enlarged
 from btfkit.materials.neumip.arrays import aligned
 from btfkit.native.neural.layout import Array, Layout, Network
+
+if TYPE_CHECKING:
+    from btfkit.fitting.prior.guess import Guess
 
 # How large guessed features are beside those at random.
 _NORMALS, _COLOURS = 0.5, 0.3
@@ -45,6 +48,8 @@ def begin_from(guess: Guess, layout: Layout, texels: Array) -> None:
     """Put what is guessed where training looks for it: heights, normals in the first frame,
     colours in the next channels. A short fit to few pairs then has only to learn the decoder.
     """
+    from btfkit.fitting.prior.guess import averaged, enlarged
+
     if layout.heights:
         surface = layout.surface(texels)
         surface[...] = enlarged(guess.height, surface.shape) / np.float32(layout.depth_scale)

@@ -172,4 +172,5 @@ def spec_of(s: Settings, size: tuple[int, int], levels: int, channels: int = 3) 
         channels=channels,
         precision=s.precision,  # type: ignore[arg-type]
         networks=s.networks,  # type: ignore[arg-type]
+        finer=s.finer if levels > 1 else 0.0,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.coverage import Coverage, spread_pairs
-from btfkit.fitting.prior.guess import Guess, guessed
 from btfkit.footprint import of_level
 from btfkit.native.draw import Images
+
+if TYPE_CHECKING:
+    from btfkit.fitting.prior.guess import Guess
 
 Array = NDArray[np.float32]
 
@@ -63,6 +65,9 @@ def guesses(
     coverage = Coverage.of(btf.light[pairs], btf.view[pairs])
     if coverage.dense:
         return None
+    # Only where directions are few: it takes scipy, half a second.
+    from btfkit.fitting.prior.guess import guessed
+
     guess = guessed(btf, pairs)
     rng = np.random.default_rng([seed, 0x9E55])
     _, h, w, _ = btf.shape

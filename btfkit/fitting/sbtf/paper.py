@@ -21,9 +21,10 @@ from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.loop import Generators, Trainable
 from btfkit.fitting.neumip.blurring import blur_at, blurred
-from btfkit.fitting.neumip.data import Batch, source_of
+from btfkit.fitting.neumip.data import Batch
 from btfkit.fitting.neumip.forward import bilinear, directions
 from btfkit.fitting.neumip.recipe import header_of, texture_size
+from btfkit.fitting.neumip.rows import source_of
 from btfkit.fitting.neumip.settings import refuse_unused
 from btfkit.fitting.sbtf.labels import Labels, labels_of
 from btfkit.fitting.sbtf.settings import PaperSettings

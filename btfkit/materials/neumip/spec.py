@@ -33,6 +33,8 @@ class NeuMIPSpec:
         curved: whether curvature bends the rays through the heights.
         holes: whether curved heights have an opacity.
         looks: at most along a ray that may pass curved heights.
+        finer: levels of detail by which every texture is finer than what it answers for alone: a
+            Gaussian of half a texel leaves more than that texel holds.
         frames: vectors among the pyramid's channels, three each, whose products with the half
             vector and the light the decoder takes too: 0, 1 or 2.
         hidden, offset_hidden: widths of the hidden layers.
@@ -69,10 +71,15 @@ class NeuMIPSpec:
     curved: bool = False
     holes: bool = False
     looks: int = CURVED_LOOKS
+    finer: float = 0.0
+
+    def begins(self, header: Header) -> float:
+        """Level of the data's grid that the finest texture resolves."""
+        return resolved_level(self.size, header.grid)
 
     def layout(self, header: Header) -> Layout:
         """The model as its kernels see it."""
-        shift = resolved_level(self.size, header.grid)
+        shift = self.begins(header) + self.finer
         banks = [
             Pyramid(
                 level_sizes(self.size, self.levels), self.features, shift=shift, name="features"
@@ -81,7 +88,7 @@ class NeuMIPSpec:
         if self.coarse:
             base = level_sizes(self.size, _COARSE + 1)[-1]
             levels = max(self.levels - _COARSE, 1)
-            start = resolved_level(base, header.grid)
+            start = resolved_level(base, header.grid) + self.finer
             banks.append(
                 Pyramid(level_sizes(base, levels), self.coarse, shift=start, name="coarse")
             )
