@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from btfkit.cli import btfkit as command
+from btfkit.cli.outcome import run
 from btfkit.fitting.choice import choose
 from btfkit.fitting.sbtf.holes import passed_under
+from btfkit.io.queryfile import read
 from btfkit.queries import Query
 from btfkit.relief import procedural
 from btfkit.relief.trace import random_queries
@@ -98,3 +101,18 @@ def test_auto_tells_yarns_from_height_fields_with_holes() -> None:
     found = choose(yarns)
     assert found.model == "sbtf"
     assert any("which no height field lets them" in reason for reason in found.reasons)
+
+
+def test_synth_writes_queries_of_yarns_and_nothing_else(tmp_path, capsys) -> None:
+    out = tmp_path / "q.npz"
+    words = ["synth", "tabby", "--as", "queries", "--size", "16", "--count", "500"]
+    assert run(command, [*words, "--curvature", "0.2,5", "-o", str(out), "--json"]) == 0
+    queries = read(out)
+    assert len(queries) == 500
+    assert queries.size == (16, 16)
+    assert np.any(queries.curvature > 0)
+    assert np.any(queries.opacity == 0)
+    for refused in (["--as", "zarr"], ["--as", "queries", "--bounces", "1"]):
+        assert run(command, ["synth", "tabby", *refused, "-o", str(tmp_path / "no")]) == 2
+        assert "tabby is no height field: --as queries alone" in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()
