@@ -44,6 +44,7 @@ from btfkit.relief import procedural
 from btfkit.relief.relief import Relief
 from btfkit.relief.trace import trace
 from btfkit.relief.yarns import weave_of, weave_queries
+from btfkit.render.gaze import gaze
 from btfkit.render.preview import Scene, camera_of, render
 from btfkit.shapes.bending import principal, vertex_forms, vertices
 from btfkit.shapes.closed import Floats, Meeting, Shape, Surface
@@ -301,11 +302,19 @@ def cost() -> Rows:
     band = on_cylinders(relief)
     query = band.query
     above = np.where(query.light[:, 2:] < 0, -query.light, query.light)
-    told = 20 / SIZE * query.curvature / query.curvature.max()  # as on a sphere of three tiles
+    told = (
+        20 / SIZE * query.curvature / query.curvature.max()
+    )  # 1/tile: radii of three tiles and more
 
     def ask(model: Material, bend: Any, rows: Any = slice(None)) -> None:
         curvature = bend if np.isscalar(bend) else bend[rows]
         model.evaluate(query.uv[rows], above[rows], query.view[rows], 0.5, curvature)
+
+    uv, view, bend = _pictured(material)
+    towards = np.ascontiguousarray(np.broadcast_to(np.float32([0, 0, 1]), view.shape))
+
+    def see(model: Material, curvature: Any) -> None:
+        model.evaluate(uv, towards, view, 0.5, curvature)
 
     lights = above[:8, None]
     passes = np.flatnonzero(material.evaluate(*query).opacity == 0)
@@ -313,6 +322,8 @@ def cost() -> Rows:
         "neumip, plane": (lambda: ask(flat, 0.0), len(above)),
         "sbtf, plane": (lambda: ask(material, 0.0), len(above)),
         "sbtf, gently curved": (lambda: ask(material, told), len(above)),
+        "neumip, torus": (lambda: see(flat, 0.0), len(uv)),
+        "sbtf, torus": (lambda: see(material, bend), len(uv)),
         "sbtf, cylinders": (lambda: ask(material, query.curvature), len(above)),
         "sbtf, rays that pass": (lambda: ask(material, query.curvature, passes), len(passes)),
         "sbtf, cylinders, 8 lights": (
@@ -326,8 +337,26 @@ def cost() -> Rows:
             start = time.process_time()
             run()
             best[label] = min(best[label], 1e9 * (time.process_time() - start) / count)
-    base = best["neumip, plane"]
-    yield {"ns": best, "times neumip": {label: ns / base for label, ns in best.items()}}
+    base = best["neumip, plane"], best["neumip, torus"]
+    yield {
+        "ns": best,
+        "times neumip": {label: ns / base["torus" in label] for label, ns in best.items()},
+    }
+
+
+def _pictured(material: SBTF) -> tuple[Floats, Floats, Floats]:
+    """uv, view and curvature of a torus' pixels in their order, which neighbours share."""
+    shape = Torus(tube=0.25, tiles=(6, 2))
+    origin, direction, beyond = _camera_rays(shape)
+    met = shape.meet(origin, direction, beyond)
+    hit = np.isfinite(met.distance)
+    met = Meeting(met.distance[hit], met.part[hit])
+    surface = shape.surface(origin[hit], direction[hit], met)
+    pixel = np.stack([direction[0], direction[0]]) * 0
+    seen = gaze(material, shape, surface, -direction[hit], pixel)
+    return (
+        seen.uv.astype(np.float32), seen.view.astype(np.float32), seen.curvature.astype(np.float32)
+    )  # fmt: skip
 
 
 PARTS: dict[str, Callable[[], Rows]] = {

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import click
 
 from btfkit.cli.bar import Bar
 from btfkit.cli.options import NumbersType, force_option, out_option, seed_option
 from btfkit.cli.outcome import Outcome, verb
+
+if TYPE_CHECKING:
+    from btfkit.queries import QuerySet
 
 KINDS = ("relief", "zarr", "ubo2003", "ubo2014", "utia", "manifest", "queries")
 
@@ -62,6 +65,12 @@ class FloatsType(click.ParamType[tuple[float, ...]]):
     type=NumbersType("LOW,HIGH", float),
     help="Queries: on cylinders of such |curvature|, 1/tile width, and on the plane.",
 )
+@click.option(
+    "--lamp-degrees",
+    type=click.FloatRange(0, 90),
+    default=0.0,
+    help="Angular diameter of the lamp.  [default: 0, a distant point]",
+)
 @seed_option
 @force_option
 def synth_verb(
@@ -81,6 +90,7 @@ def synth_verb(
     count: int,
     footprints: tuple[float, ...],
     curvature: tuple[float, float] | None,
+    lamp_degrees: float,
     seed: int,
     force: bool,
 ) -> Outcome:
@@ -88,17 +98,31 @@ def synth_verb(
 
     What it writes is synthetic, and says so.
     """
-    from btfkit.relief import procedural
+    from btfkit.relief import procedural, yarns
     from btfkit.relief.synth import relief_btf
 
     if listing or name is None:
-        about = procedural.described()
+        about = procedural.described() | yarns.ABOUT
         lines = [f"{each:<11}{line}" for each, line in about.items()]
         return Outcome("\n".join(lines), {"materials": list(about), "about": about})
     if out is None:
         raise click.UsageError("Missing option '-o' / '--out'.")
     if kind != "queries" and curvature is not None:
         raise click.UsageError("--curvature is for --as queries")
+    if lamp_degrees and kind == "relief":
+        raise click.UsageError("--lamp-degrees is for what is lit: not --as relief")
+    if name in yarns.CATALOGUE:
+        if kind != "queries" or lamp_degrees or bounces or clamp or relief_texels is not None:
+            raise click.UsageError(
+                f"{name} is no height field: --as queries alone, without --relief, --bounces, "
+                "--clamp and --lamp-degrees"
+            )
+        bar.phase("tracing and writing")
+        woven = yarns.weave_queries(
+            name, count, size=size, seed=seed, footprints=footprints, curvatures=curvature,
+            samples=samples or 4, lowest_z=_lowest(curvature),
+        )  # fmt: skip
+        return _written_queries(woven, out, name, force=force)
     bar.phase("making the relief")
     relief = procedural.make(
         name, size, relief_texels=relief_texels, seed=seed, wrap="clamp" if clamp else "wrap"
@@ -109,20 +133,30 @@ def synth_verb(
 
         write(relief, out, force=force)
     elif kind == "queries":
-        from btfkit.io import queryfile
         from btfkit.relief.trace import SAMPLES, random_queries
 
+        rays = samples or SAMPLES
         queries = random_queries(
-            relief, count, seed=seed, bounces=bounces, samples=samples or SAMPLES,
-            footprints=footprints, curvatures=curvature,
-            # On cylinders the silhouettes are the point, and they lie near the horizon.
-            lowest_z=0.1 if curvature is None else 0.02,
+            relief, count, seed=seed, bounces=bounces, samples=1 if lamp_degrees else rays,
+            footprints=footprints, curvatures=curvature, lowest_z=_lowest(curvature),
         )  # fmt: skip
-        queryfile.write(queries, out, force=force)
+        if lamp_degrees:
+            from btfkit.relief.lamp import lamp_queries
+
+            queries = lamp_queries(
+                queries, relief, lamp_degrees, samples=rays, bounces=bounces, seed=seed
+            )
+        return _written_queries(queries, out, name, force=force)
     else:
         btf = relief_btf(
             relief, lights=lights, views=views, samples=samples or 4, bounces=bounces, seed=seed
         )
+        if lamp_degrees:
+            from btfkit.relief.lamp import lamp_btf
+
+            btf = lamp_btf(
+                btf, relief, lamp_degrees, samples=samples or 4, bounces=bounces, seed=seed
+            )
         if kind == "zarr":
             from btfkit.io.store import writer
 
@@ -131,9 +165,24 @@ def synth_verb(
             from btfkit.cli.convert import written
 
             written(btf, out, {"ubo2014": "btf"}.get(kind, kind), {}, force=force, progress=bar)
+    return _made(out, name, kind)
+
+
+def _lowest(curvature: tuple[float, float] | None) -> float:
+    """Of views: on cylinders the silhouettes are the point, and they lie near the horizon."""
+    return 0.1 if curvature is None else 0.02
+
+
+def _written_queries(queries: QuerySet, out: Path, name: str, *, force: bool) -> Outcome:
+    from btfkit.io import queryfile
+
+    queryfile.write(queries, out, force=force)
+    return _made(out, name, "queries")
+
+
+def _made(out: Path, name: str, kind: str) -> Outcome:
     line = f"{out}: {name}, synthetic, as {kind}"
-    data = {"out": out, "name": name, "as": kind}
-    return Outcome(line, data, then=_next(out, kind))
+    return Outcome(line, {"out": out, "name": name, "as": kind}, then=_next(out, kind))
 
 
 def _next(out: Path, kind: str) -> str:

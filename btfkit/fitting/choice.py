@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from btfkit import directions
 from btfkit.btf import BTF
-from btfkit.fitting.sbtf.holes import seen_through
+from btfkit.fitting.sbtf.holes import passed_under, seen_through
 from btfkit.queries import QuerySet
 
 # Fewer pairs say little about gloss; fewer than the second are told apart by their neighbours.
@@ -21,6 +21,8 @@ _FEW, _SPARSE = 8, 24
 FLAT_TEXELS = 0.02
 _BLOCK, _SIGMA = 8, 0.7
 _MOST_VIEWS, _LIGHTS_A_VIEW = 16, 3
+# Share of rays that pass under something solid, from which on it is no height field's doing.
+_UNDER = 0.02
 # What a part that is left out would have bought: docs/benchmarks.md, skips; docs/neumip.md.
 _OFFSET = "heights would take a sixth of a query's time and buy nothing"
 _LEVELS = "coarser ones would take a third more memory and serve wider footprints alone"
@@ -54,6 +56,12 @@ def _for_queries(queries: QuerySet) -> Choice:
         curved = "the queries have curvature, under which rays may pass the material"
         through = "rays pass on the plane, through holes that heights alone do not have"
         told = [curved] * bool(np.any(bend != 0)) + [through] * holes
+        under = passed_under(valid) if holes else 0.0
+        if under > _UNDER:
+            told.append(
+                f"{under:.0%} of the rays that pass leave where an upright ray is stopped, which "
+                "no height field lets them: the one that explains most is taken"
+            )
         return Choice("sbtf", tuple(f"sbtf: {reason}" for reason in told))
     reasons = ["neumip: queries have no images that could guide a texture"]
     settings = {}

@@ -134,7 +134,8 @@ def answer(
         for _ in range(samples):
             spread = (part.footprint / size)[:, None] if samples > 1 else 0.0
             jitter = spread * rng.standard_normal(part.uv.shape)
-            colour, hit = _shaded(weave, part._replace(uv=part.uv + jitter))
+            moved = (part.uv + jitter).astype(np.float32)
+            colour, hit = _shaded(weave, part._replace(uv=moved))
             total += colour
             hits += hit
         rgb[at] = total / np.maximum(hits, 1)[:, None]
@@ -205,7 +206,9 @@ def _shaded(weave: Weave, query: Query) -> tuple[Floats, Floats]:
     return colour, hit.astype(float)
 
 
-def _met(weave: Weave, bent: _Bent, origin: Floats, direction: Floats) -> tuple[Floats, Floats]:
+def _met(
+    weave: Weave, bent: _Bent, origin: Floats, direction: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
     """Way (b,) along straight rays (b, 3) to the first yarn, and whether there is one."""
     count, deep = len(origin), weave.thickness
     way, hit = np.zeros(count), np.zeros(count, bool)

@@ -14,7 +14,7 @@ from btfkit.errors import FitError
 from btfkit.fitting.fit import fit
 from btfkit.fitting.sbtf import tracing
 from btfkit.fitting.sbtf.holes import opacity_of, thickness_of
-from btfkit.fitting.sbtf.outlines import moved
+from btfkit.fitting.sbtf.outlines import carved, moved
 from btfkit.fitting.sbtf.tracing import queries_of
 from btfkit.materials.base import Header, Material
 from btfkit.materials.neumip.arrays import aligned, name_arrays
@@ -23,7 +23,7 @@ from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.materials.sbtf.material import SBTF
 from btfkit.native.neural import bent
 from btfkit.program import Heights
-from btfkit.queries import Query
+from btfkit.queries import Query, QuerySet
 from btfkit.relief import procedural
 from btfkit.relief.material import TracedRelief
 from btfkit.relief.relief import Relief
@@ -173,13 +173,72 @@ def test_outlines_alone_carve_heights_that_pass_what_passes(wrap) -> None:
         return metrics.iou(found.opacity[band], opacity[band])
 
     before = iou(heights)
-    for _ in range(100):
+    for _ in range(60):
         heights = heights + moved(
             Heights(heights, 0.05, curved=True), query.uv, query.view, query.curvature,
             opacity == 0, aspect=1.0, wrap=wrap,
         )  # fmt: skip
     assert before < 0.6
     assert iou(heights) > 0.9
+
+
+def told(opacity: np.ndarray, query: Query) -> QuerySet:
+    return QuerySet(query.uv, query.light, query.view, curvature=query.curvature, opacity=opacity)
+
+
+@pytest.mark.parametrize("wrap", [True, False])
+def test_rays_that_pass_carve_heights_at_once(wrap) -> None:
+    query, unit = on_cylinders(20000), np.float32(0.05)
+    heights = relief().height / unit
+    truth = Heights(heights, 0.05, curved=True)
+    opacity = bent.meet(
+        truth, query.uv, query.view, query.curvature, aspect=1.0, wrap=wrap
+    ).opacity  # fmt: skip
+    found = carved(told(opacity, query), (SIZE, SIZE), scale=0.05, aspect=1.0, wrap=wrap)
+    assert found is not None
+    assert found.dtype == np.float32
+    # As deep as the deepest ray that passed, and no deeper than what it passed.
+    assert heights.min() * 1.05 < found.min() < 0.3 * heights.min()
+    assert found.max() <= 0
+    band = ~bent.rays_of(truth, query.view, query.curvature, 1.0).reaches
+
+    def iou(of: np.ndarray) -> float:
+        met = bent.meet(Heights(of, 0.05, curved=True), query.uv, query.view, query.curvature,
+                        aspect=1.0, wrap=wrap)  # fmt: skip
+        return metrics.iou(met.opacity[band], opacity[band])
+
+    assert iou(found) > 0.93
+    assert iou(0 * heights) < 0.7
+
+
+def test_where_no_ray_passes_nothing_is_carved() -> None:
+    query = on_cylinders(500)
+    stopped = told(np.ones(500, np.float32), query)
+    assert carved(stopped, (8, 8), scale=0.05, aspect=1.0, wrap=True) is None
+    flat = replace(stopped, curvature=None, opacity=np.zeros(500, np.float32))
+    assert carved(flat, (8, 8), scale=0.05, aspect=1.0, wrap=True) is None
+    concave = replace(flat, curvature=-query.curvature)
+    assert carved(concave, (8, 8), scale=0.05, aspect=1.0, wrap=True) is None
+    # Few rays reach few texels: the others take what lies around.
+    few = told(np.zeros(3, np.float32), Query(*(part[:3] for part in query)))
+    found = carved(few, (8, 8), scale=0.05, aspect=1.0, wrap=True)
+    assert found is not None
+    assert np.isfinite(found).all()
+    assert (found <= 0).all()
+
+
+def test_one_ray_through_an_unseen_hole_does_not_make_a_relief_deep() -> None:
+    query = on_cylinders(20000)
+    truth = Heights(relief().height / np.float32(0.05), 0.05, curved=True)
+    opacity = bent.meet(
+        truth, query.uv, query.view, query.curvature, aspect=1.0, wrap=True
+    ).opacity  # fmt: skip
+    upright = int(np.argmax(query.view[:, 2] / query.curvature))
+    opacity[upright] = 0
+    found = carved(told(opacity, query), (SIZE, SIZE), scale=0.05, aspect=1.0, wrap=True)
+    assert found is not None
+    # No relief reaches the axis of the sharpest cylinder: 0.9 of a radius of 1 / 0.85 depths.
+    assert found.min() > 1.1 * relief().height.min() / 0.05
 
 
 def test_without_opacity_no_outline_is_known() -> None:
@@ -291,6 +350,20 @@ def test_its_outline_on_a_shape_is_the_traced_one(shape) -> None:
     assert metrics.iou(*covers) > 0.99
     assert metrics.iou(solid, covers[1]) < metrics.iou(*covers)
     assert not (covers[0] & ~solid).any()
+
+
+def test_back_faces_of_a_body_are_passed_and_never_asked_as_fronts() -> None:
+    material = random_sbtf(relief().height)
+    tube, view = shape_of("cylinder"), np.array([0.0, 0.8, 0.6])
+    solid = random_sbtf(np.zeros((4, 4), np.float32))
+    covers = [
+        render(Scene(m, tube, np.array([[0.0, 0.6, 0.8]])), view=view, size=(48, 48)).cover
+        for m in (material, solid)
+    ]
+    # The open tube's inside is the back of its far wall: it covers nothing.
+    inside = covers[1] == 0
+    assert inside[:24].sum() > 0
+    assert not covers[0][inside].any()
 
 
 def test_light_passes_where_rays_pass() -> None:

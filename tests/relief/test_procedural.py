@@ -12,7 +12,7 @@ from btfkit import directions
 from btfkit.cli import btfkit as command
 from btfkit.cli.outcome import run
 from btfkit.io import queryfile
-from btfkit.relief import file, procedural, synth, trace
+from btfkit.relief import file, procedural, synth, trace, yarns
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -111,11 +111,11 @@ def test_slopes_towards_the_light_are_bright_and_shadows_fall_away_from_it(
 def test_each_material_has_a_line_about_it(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(command, ["synth", "--list"]) == 0
     lines = capsys.readouterr().out.strip().split("\n")
-    assert [line.split()[0] for line in lines] == list(procedural.CATALOGUE)
+    assert [line.split()[0] for line in lines] == [*procedural.CATALOGUE, *yarns.CATALOGUE]
     assert all(len(line.split()) > 4 for line in lines)
     assert run(command, ["synth", "--list", "--json"]) == 0
     about = json.loads(capsys.readouterr().out)["about"]
-    assert about == procedural.described()
+    assert about == procedural.described() | yarns.ABOUT
 
 
 def test_queries_on_cylinders_are_written_for_fits(tmp_path: Path) -> None:

@@ -168,3 +168,17 @@ def test_places_of_a_footprint_have_its_mean_and_its_variance() -> None:
     place = offsets()
     np.testing.assert_allclose(place.mean(axis=0), 0, atol=1e-12)
     np.testing.assert_allclose(np.cov(place.T, bias=True), np.eye(2), atol=1e-12)
+
+
+@pytest.mark.parametrize("wide", [1e3, 1e30])
+def test_footprints_of_many_tiles_have_the_mean_opacity_of_all_places(wide: float) -> None:
+    known = relief()
+    material, query = model(known.height), on_cylinders(-float(known.height.min()), 60)
+    found = material.evaluate(*query._replace(footprint=np.full(60, wide, np.float32)))
+    assert np.isfinite(found.reflectance).all()
+    one = Query(*(np.repeat(part[:1], 4000, axis=0) for part in query))
+    one = one._replace(uv=np.random.default_rng(3).random((4000, 2), np.float32),
+                       footprint=np.full(4000, 0.5, np.float32))  # fmt: skip
+    # Twelve rays of a mean between 0 and 1: three of their deviations.
+    assert found.opacity[0] == pytest.approx(material.evaluate(*one).opacity.mean(), abs=0.43)
+    assert ((found.opacity > 0) & (found.opacity < 1)).any()

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from btfkit import metrics
+from btfkit.conventions import displacement
 from btfkit.native.neural import bent
 from btfkit.native.neural.layout import Array
 from btfkit.native.neural.lookup import bilinear
@@ -19,6 +20,9 @@ _STEEP, _FLAT, _ROWS = 0.9, 0.8, 8192
 _TRIED, _THICKEST = 12, 4.0
 # Share of rays over the plane that pass where a material is seen through.
 _FEW = 1e-3
+# The largest thickness that is tried where no height is known, tiles, and texels a side where
+# queries do not say them.
+_THICKEST_TILES, _GRID = 0.3, 64
 
 
 def seen_through(queries: QuerySet) -> bool:
@@ -90,3 +94,31 @@ def thickness_of(
 def solid_at(opacity: Array, uv: Array, *, wrap: bool) -> NDArray[np.bool_]:
     """(b,) whether there is no hole at uv (b, 2)."""
     return np.asarray(bilinear(opacity[..., None], uv, wrap=wrap)[:, 0] >= 0.5)
+
+
+def passed_under(queries: QuerySet) -> float:
+    """Share of rays over the plane that pass and leave where an upright ray is stopped.
+
+    What a height field has there reaches down to its underside, so that none does; what crosses
+    over something else lets them pass. Of all thicknesses the one with the fewest.
+
+    Args:
+        queries: valid rows, with opacity and size.
+    """
+    assert queries.opacity is not None
+    size = queries.size or (_GRID, _GRID)
+    rows = np.ones(len(queries), bool) if queries.curvature is None else queries.curvature == 0
+    plane = queries.subset(rows)
+    assert plane.opacity is not None
+    passing = np.flatnonzero((plane.opacity < 0.1) & (plane.view[:, 2] < _FLAT))[:_ROWS]
+    if not len(passing) or not (plane.view[:, 2] > _STEEP).any():
+        return 0.0
+    solid = opacity_of(plane, size, wrap=True) > 0.9
+    x, y, z = plane.view[passing].T
+    way = np.stack(displacement(-x, -y, z, size[1] / size[0]), axis=1)
+    shares = []
+    for thickness in np.geomspace(0.5 / size[1], _THICKEST_TILES, 2 * _TRIED):
+        end = plane.uv[passing] + thickness * way
+        col, row = (np.floor((end - np.floor(end)) * size[::-1]).astype(int) % size[::-1]).T
+        shares.append(float(solid[row, col].mean()))
+    return min(shares)

@@ -97,23 +97,25 @@ class SBTF(Marching[Settings]):
         if self.spec.holes:
             assert self._known is not None
             self._opacity = holes.opacity_of(self._known, self.spec.size, wrap=self.layout.wrap)
-        self._begin_carved()
-        if self.spec.holes:
             self._look_for_thickness()
             self._keep_given()
 
     def _begin_carved(self) -> None:
-        """Begin with the heights that outlines tell, where heights are not known."""
-        if self._known is None or not self._outlined or self.settings.heights == "given":
+        """Begin with the heights that outlines tell, where no relief does."""
+        if self._known is None or not self._outlined or self._given is not None:
             return
         layout = self.layout
         heights = carved(
             self._known, self.spec.size, scale=layout.depth_scale, aspect=layout.aspect,
             wrap=layout.wrap, opacity=self._opacity, seed=self._generators.seed,
         )  # fmt: skip
-        if heights is not None:
-            _, texels = self.engine.parameters()
-            layout.surface(texels)[...] = heights
+        if heights is None:
+            return
+        _, texels = self.engine.parameters()
+        layout.surface(texels)[...] = heights
+        if self.spec.holes:
+            self._look_for_thickness()
+            self._keep_given()
 
     def know(self, relief: Relief) -> None:
         """Take the heights, and the holes, of the relief behind the data, its top at 0."""
@@ -135,6 +137,8 @@ class SBTF(Marching[Settings]):
                 "heights=given, and the source is no relief",
                 remedy="leave heights out, and they are found",
             )
+        if not self._steps:
+            self._begin_carved()
         loss = super().step(progress)
         if self.spec.holes and self._given is None and self._steps % _THICKNESS_STEPS == 0:
             self._look_for_thickness()

@@ -12,6 +12,8 @@ from btfkit.queries import Query
 
 # Rays of a footprint that may pass: an outline then has as many steps of grey.
 RAYS = 12
+# Tiles that a footprint is taken as at most: a wider one sees what this one does.
+_WIDEST = 4.0
 _GOLDEN = np.pi * (3 - np.sqrt(5))
 
 
@@ -52,7 +54,8 @@ def softened(
         query.curvature[rows],
     )  # fmt: skip
     # What a texel's own footprint does not hold, as levels of textures are blurred.
-    spread = np.sqrt(part.footprint**2 - 0.25)[:, None] / np.array(grid[::-1])
+    wide = np.minimum(part.footprint.astype(float), _WIDEST * max(grid))
+    spread = np.sqrt(wide**2 - 0.25)[:, None] / np.array(grid[::-1])
     total, stopped = np.zeros((*rgb.shape[:-2], len(rows), rgb.shape[-1])), np.zeros(len(rows))
     for offset in offsets():
         moved = (part.uv + spread * offset).astype(part.uv.dtype)
