@@ -12,6 +12,7 @@ from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from btfkit import directions
 from btfkit.btf import BTF
@@ -29,6 +30,9 @@ _MOST_VIEWS, _MOST_LIGHTS = 32, 48
 _NORMAL_VIEWS, _PARALLAX_LIGHTS, _STEEP = 8, 12, 0.5
 # The largest value of an image is a clipped one where so many texels have it, unless half do.
 _CLIPPED_TEXELS, _CLIPPED_SHARE = 4, 0.0005
+# Views count by this power of the width in which they show a texel's surface: what it bought is in
+# docs/heightfields.md.
+_SHOWN = 8.0
 _LARGEST = float(np.finfo(np.float16).max)
 
 
@@ -133,6 +137,19 @@ class Stack:
             )  # fmt: skip
         return out
 
+    def shown(self, slope: Floats) -> Array:
+        """(t, n) weights of pairs, 1 where a view shows a surface as wide as the plane, or wider.
+
+        A view sees a surface that turns away from it in a narrow part of its picture. What lies
+        between its pixels is lost there, and convex parts look lower than they are.
+
+        Args:
+            slope: (t, 2) dz/dx, dz/dy.
+        """
+        tangent = self.views[:, :2] / np.maximum(self.views[:, 2:], 1e-3)
+        width = np.clip(1 - slope @ tangent.T, 0, 1) ** _SHOWN
+        return width[:, self.view_of].astype(np.float32)
+
     def place(self, height: Array, rows: slice) -> Array:
         """(t, 3) points of the surface over the texels of some rows, as positions count."""
         return places(height, rows)
@@ -145,6 +162,15 @@ def places(height: Array, rows: slice = slice(None)) -> Array:
     row, col = (part.reshape(-1).astype(np.float32) for part in grid)
     x, y = col + 0.5 - w / 2, h / 2 - 0.5 - row
     return np.stack([x, y, height[rows].reshape(-1)], axis=1).astype(np.float32)
+
+
+def slopes(height: Array, *, wrap: bool) -> Array:
+    """(h, w, 2) dz/dx, dz/dy of heights in texels, softened by a texel."""
+    soft = gaussian_filter(height, 1.0, mode="wrap" if wrap else "nearest")
+    around = np.pad(soft, 1, mode="wrap" if wrap else "edge")
+    dx = (around[1:-1, 2:] - around[1:-1, :-2]) / 2
+    dy = (around[:-2, 1:-1] - around[2:, 1:-1]) / 2
+    return np.stack([dx, dy], axis=-1).astype(np.float32)
 
 
 def read_stack(btf: BTF, *, progress: Progress | None = None) -> Stack:

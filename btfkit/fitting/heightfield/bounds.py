@@ -45,7 +45,7 @@ def shadow_bounds(stack: Stack, height: Array, normals: Normals) -> Bounds:
         normals: fitted there.
     """
     h, w = stack.size
-    share, facing = _lit_share(stack, height, normals)
+    share, facing = lit_share(stack, height, normals)
     lines = np.stack([_shadow_line(height, light, wrap=stack.wrap) for light in stack.lights])
     lit = (share > _LIT) & facing
     dark = (share < _DARK) & facing
@@ -62,7 +62,7 @@ def shadow_bounds(stack: Stack, height: Array, normals: Normals) -> Bounds:
     )
 
 
-def _lit_share(stack: Stack, height: Array, normals: Normals) -> tuple[Floats, NDArray[np.bool_]]:
+def lit_share(stack: Stack, height: Array, normals: Normals) -> tuple[Floats, NDArray[np.bool_]]:
     """(k, h, w) of each light: its values in parts of the model's; whether it faces the surface."""
     h, w = stack.size
     seen = visibility(height, stack.views, wrap=stack.wrap)
