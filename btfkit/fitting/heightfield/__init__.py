@@ -316,7 +316,9 @@ def _expected_error(fused: Fused, swept: Sweep) -> Array:
 
 
 def of_stack(btf: BTF, stack: Stack) -> BTF:
-    """The pairs of a stack, which lie in memory already."""
+    """The pairs of a stack, from memory where they lie there."""
+    if isinstance(stack.values, np.memmap):
+        return btf.subset(stack.pairs)
     textures = as_textures(np.ascontiguousarray(stack.values.transpose(2, 0, 1, 3)))
     return replace(btf.subset(stack.pairs), textures=textures, validity=None, variance=None)
 
