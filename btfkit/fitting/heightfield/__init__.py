@@ -18,7 +18,7 @@ from btfkit.btf import BTF, Wrap
 from btfkit.fitting.analytic import Maps, fit_maps
 from btfkit.fitting.heightfield import orientation
 from btfkit.fitting.heightfield.alone import SWEEPS, by_light
-from btfkit.fitting.heightfield.bounds import shadow_bounds
+from btfkit.fitting.heightfield.bounds import Bounds, shadow_bounds
 from btfkit.fitting.heightfield.fusion import Fused, fuse
 from btfkit.fitting.heightfield.parallax import Sweep, disagreement, fitted_heights, reached, sweep
 from btfkit.heldout import split
@@ -257,7 +257,7 @@ def _in_rounds(
     """Normals, sweep and fusion again and again, from heights that a model found."""
     before = disagreement(many, np.zeros_like(height))
     heights = {"model": height}
-    found: tuple[Normals, Sweep, Fused] | None = None
+    found: tuple[Normals, Sweep, Fused, Bounds | None] | None = None
     done, longest = 0, 0.0
     for step in SWEEPS:
         now = time.perf_counter()
@@ -268,7 +268,7 @@ def _in_rounds(
         height = found[2].height
         done, longest = done + 1, max(longest, time.perf_counter() - now)
     assert found is not None
-    normals, swept, fused = found
+    normals, swept, fused, bounds = found
     alone = integrate(normals.slope, slope_weights(normals), wrap=few.wrap).height
     heights |= {"normals": alone + height.mean() - alone.mean(), "parallax": swept.height}
     heights["fusion"] = height
@@ -279,6 +279,7 @@ def _in_rounds(
             f"{a} - {b}": float(np.sqrt(np.median(np.square(heights[a] - heights[b]))))
             for a, b in (("normals", "parallax"), ("normals", "fusion"), ("parallax", "fusion"))
         },
+        "shadows": None if bounds is None else bounds.kept_by(height),
         "expected_error_texels": float(np.median(_expected_error(fused, swept))),
         "rounds": done,
         "rounds_planned": len(SWEEPS),
@@ -296,17 +297,18 @@ def _round(
     *,
     bounded: bool,
     seed: int,
-) -> tuple[Normals, Sweep, Fused]:
-    """Normals, sweep and fusion around heights, with the relief's own visibility."""
+) -> tuple[Normals, Sweep, Fused, Bounds | None]:
+    """Normals, sweep, fusion and bounds around heights, with the relief's own visibility."""
     lit, looked = (visibility(height, d, wrap=few.wrap) for d in (few.lights, few.views))
     visible = lit[few.light_of] & looked[few.view_of]
     normals = photometric_stereo(few, height=height, visible=visible, start=before)
     swept = sweep(many, height, normals, step=step)
+    bounds = shadow_bounds(few, height, normals) if bounded else None
     fused = fuse(
         normals.slope, normals.variance[..., [0, 2]], swept.height, swept.variance,
-        wrap=few.wrap, bounds=shadow_bounds(few, height, normals) if bounded else None, seed=seed,
+        wrap=few.wrap, bounds=bounds, seed=seed,
     )  # fmt: skip
-    return normals, swept, fused
+    return normals, swept, fused, bounds
 
 
 def _expected_error(fused: Fused, swept: Sweep) -> Array:
