@@ -95,6 +95,9 @@ def fit(
     if relief is not None and chosen in TRACED:
         parts = {**parts, "wrap": relief.wrap}
     given = {**parts, **as_text(settings or {})}
+    if relief is None and chosen == "sbtf" and isinstance(data, BTF):
+        relief, told = _relief_behind(data, given, plan, budget_s, phases, progress)
+        choice = (*choice, told) if told else choice
     if chosen in CLOSED_FORM:
         train = split(len(data), holdout, seed)[0]
         material, run = solved(data.subset(train), chosen, given, plan, progress)
@@ -225,6 +228,29 @@ def _chosen(source: BTF | QuerySet, model: str) -> tuple[str, tuple[str, ...], M
 
     choice = choose(source)
     return choice.model, choice.reasons, choice.settings
+
+
+def _relief_behind(
+    data: BTF,
+    given: Mapping[str, str],
+    plan: Plan,
+    budget_s: float,
+    phases: Phases,
+    progress: Progress | None,
+) -> tuple[Relief | None, str]:
+    """The relief of the training pairs, for outlines; what is said of it, or nothing."""
+    if given.get("heights", "auto") == "found":
+        return None, ""
+    from btfkit.fitting.heightfield.chain import relief_behind
+
+    phases.begin("heights")
+    train = data.subset(split(len(data), plan.holdout, plan.seed)[0])
+    relief, told = relief_behind(
+        train, budget_s=None if plan.steps is not None else budget_s, steps=plan.steps,
+        seed=plan.seed, progress=progress,
+    )  # fmt: skip
+    phases.begin("reading")
+    return relief, told
 
 
 def _covered(data: BTF | QuerySet, plan: Plan) -> Coverage | None:

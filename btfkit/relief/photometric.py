@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from btfkit.errors import FitError
 from btfkit.native.lobe import Lobes, Start, better, fit_lobes
-from btfkit.relief.stack import Stack
+from btfkit.relief.stack import Stack, slopes
 
 Array = NDArray[np.float32]
 Floats = NDArray[Any]
@@ -30,7 +30,7 @@ _FLATTEST_SPAN = 0.02
 _GLOSS, _ROUGHNESS = 0.04, 0.4
 _STEEPEST = 0.05
 # Pairs count by this power of the view's cosine: measured, see docs/heightfields.md.
-_UPRIGHT = 4.0
+_UPRIGHT = 2.0
 # A slope known to this deviation has half the confidence of one known exactly.
 _HALF_SLOPE = 0.05
 # Systematic part of a slope's error: interpolation, reflectance that is no single lobe.
@@ -99,12 +99,14 @@ def photometric_stereo(
     flat = np.zeros((h, w), np.float32) if height is None else height
     grey = stack.grey
     upright = _upright(stack)
+    turned = slopes(flat, wrap=stack.wrap) if start is None else start.slope
     parts: list[Lobes] = []
     step = max(_MOST_VALUES // (w * len(stack.pairs)), 1)
     for first in range(0, h, step):
         rows = slice(first, min(first + step, h))
         values = stack.seen(grey, flat, rows)
         weight = _weights(values, visible, rows) * upright
+        weight *= stack.shown(turned[rows].reshape(-1, 2))
         begin = None if start is None else start.lobes(rows)
         parts.append(_fitted(stack, values, weight, stack.place(flat, rows), begin))
         if progress:

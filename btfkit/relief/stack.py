@@ -5,6 +5,8 @@ Lengths are in texels: a place is (column, row), heights count texel edges, rows
 
 from __future__ import annotations
 
+import math
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,6 +14,7 @@ from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from btfkit import directions
 from btfkit.btf import BTF
@@ -21,14 +24,18 @@ Array = NDArray[np.float32]
 Floats = NDArray[Any]
 Progress = Callable[[int, int], None]
 
-# Bytes that a stack may take, and pairs beyond which more of them tell a texel little.
-_MOST_BYTES = 3 << 29
+# Bytes that a stack may take in memory, and on disk where it takes more; pairs beyond which more of
+# them tell a texel little.
+_MOST_BYTES, _MOST_DISK = 3 << 29, 1 << 36
 _MOST_VIEWS, _MOST_LIGHTS = 32, 48
 # Of these few views all lights, for normals; of these few lights all views, for parallax. Normals
 # do without views flatter than 60 degrees.
 _NORMAL_VIEWS, _PARALLAX_LIGHTS, _STEEP = 8, 12, 0.5
 # The largest value of an image is a clipped one where so many texels have it, unless half do.
 _CLIPPED_TEXELS, _CLIPPED_SHARE = 4, 0.0005
+# Views count by this power of the width in which they show a texel's surface: what it bought is in
+# docs/heightfields.md.
+_SHOWN = 8.0
 _LARGEST = float(np.finfo(np.float16).max)
 
 
@@ -38,7 +45,8 @@ class Stack:
     """Some pairs of a BTF, all values of a texel side by side, sorted by view.
 
     Attributes:
-        values: (h, w, n, c) float16; NaN where not measured or saturated.
+        values: (h, w, n, c) float16; NaN where not measured or saturated. On disk, in a file
+            without a name, where they are many: all that read them go from rows to rows.
         pairs: (n,) of the BTF. light, view: (n, 3) unit vectors.
         light_near, view_near: (n, 3) positions in texels from the centre of the sample, or None.
         light_of, view_of: (n,) which distinct direction each is.
@@ -71,7 +79,7 @@ class Stack:
         """(h, w, n, 1) mean of the channels."""
         if self.values.shape[3] == 1:
             return self.values
-        out = np.empty((*self.values.shape[:3], 1), np.float16)
+        out = _room((*self.values.shape[:3], 1))
         # Row by row, to spare memory.
         for row, into in zip(self.values, out, strict=True):
             into[..., 0] = row.mean(axis=-1, dtype=np.float32)
@@ -82,8 +90,11 @@ class Stack:
         at = np.flatnonzero(keep)
         lights, light_of = directions.unique(self.light[at])
         views, view_of = directions.unique(self.view[at])
+        values = _room((*self.size, len(at), self.values.shape[3]))
+        for row, into in zip(self.values, values, strict=True):
+            into[...] = row[:, at]
         return replace(
-            self, values=self.values[:, :, at], pairs=self.pairs[at],
+            self, values=values, pairs=self.pairs[at],
             light=self.light[at], view=self.view[at],
             light_near=None if self.light_near is None else self.light_near[at],
             view_near=None if self.view_near is None else self.view_near[at],
@@ -133,6 +144,19 @@ class Stack:
             )  # fmt: skip
         return out
 
+    def shown(self, slope: Floats) -> Array:
+        """(t, n) weights of pairs, 1 where a view shows a surface as wide as the plane, or wider.
+
+        A view sees a surface that turns away from it in a narrow part of its picture. What lies
+        between its pixels is lost there, and convex parts look lower than they are.
+
+        Args:
+            slope: (t, 2) dz/dx, dz/dy.
+        """
+        tangent = self.views[:, :2] / np.maximum(self.views[:, 2:], 1e-3)
+        width = np.clip(1 - slope @ tangent.T, 0, 1) ** _SHOWN
+        return width[:, self.view_of].astype(np.float32)
+
     def place(self, height: Array, rows: slice) -> Array:
         """(t, 3) points of the surface over the texels of some rows, as positions count."""
         return places(height, rows)
@@ -147,6 +171,15 @@ def places(height: Array, rows: slice = slice(None)) -> Array:
     return np.stack([x, y, height[rows].reshape(-1)], axis=1).astype(np.float32)
 
 
+def slopes(height: Array, *, wrap: bool) -> Array:
+    """(h, w, 2) dz/dx, dz/dy of heights in texels, softened by a texel."""
+    soft = gaussian_filter(height, 1.0, mode="wrap" if wrap else "nearest")
+    around = np.pad(soft, 1, mode="wrap" if wrap else "edge")
+    dx = (around[1:-1, 2:] - around[1:-1, :-2]) / 2
+    dy = (around[:-2, 1:-1] - around[2:, 1:-1]) / 2
+    return np.stack([dx, dy], axis=-1).astype(np.float32)
+
+
 def read_stack(btf: BTF, *, progress: Progress | None = None) -> Stack:
     """Well spread pairs of a BTF, each read once.
 
@@ -159,7 +192,7 @@ def read_stack(btf: BTF, *, progress: Progress | None = None) -> Stack:
     order = np.argsort(view_of, kind="stable")
     pairs, light_of, view_of = pairs[order], light_of[order], view_of[order]
     _, h, w, c = btf.shape
-    values = np.empty((h, w, len(pairs), c), np.float16)
+    values = _room((h, w, len(pairs), c))
     unmeasured = saturated = 0
     for start in range(0, len(pairs), 8):
         run = slice(start, min(start + 8, len(pairs)))
@@ -177,6 +210,15 @@ def read_stack(btf: BTF, *, progress: Progress | None = None) -> Stack:
         light_of=light_of, view_of=view_of, lights=lights, views=views,
         wrap=btf.wrap == "wrap", unmeasured=unmeasured, saturated=saturated,
     )  # fmt: skip
+
+
+def _room(shape: tuple[int, ...]) -> NDArray[np.float16]:
+    """An array in memory, or in a temporary file where it is large."""
+    if 2 * math.prod(shape) <= _MOST_BYTES:
+        return np.empty(shape, np.float16)
+    with tempfile.TemporaryFile() as file:
+        # The file is gone with its last reader.
+        return np.memmap(file, np.float16, "w+", shape=shape)
 
 
 def sampled(values: Floats, row: Floats, col: Floats, *, wrap: bool) -> Array:
@@ -229,7 +271,7 @@ def chosen(btf: BTF) -> NDArray[np.intp]:
     if not good.any():
         raise ValueError("no pair is lit from above the horizon")
     _, h, w, c = btf.shape
-    most = max(_MOST_BYTES // (2 * h * w * c), 1)
+    most = max(_MOST_DISK // (2 * h * w * c), 1)
     (lights, light_of), (views, view_of) = (directions.unique(d) for d in (btf.light, btf.view))
     if len(views) > 1 and len(lights) > 1 and int(good.sum()) > len(views) + len(lights):
         wide = spread(lights, _MOST_LIGHTS), spread(views, _MOST_VIEWS)

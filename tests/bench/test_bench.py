@@ -445,13 +445,15 @@ def training_part(store):
 
 @pytest.mark.slow
 def test_stages_of_a_calibration_are_measured_by_themselves_and_kept(tmp_path, capsys):
-    line = ["bench", "merge", "bundle", "rectify", "--quick", "-o", str(tmp_path / "out"), "--json"]
+    names = ["merge", "bundle", "rectify", "heightfield"]
+    line = ["bench", *names, "--quick", "-o", str(tmp_path / "out"), "--json"]
     assert run_cli(btfkit, line) == 0
     found = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert found["cells"] == []
     stages = found["stages"]
     assert [len({row[size] for row in stages[name]}) for name, size in
-            (("merge", "megapixels"), ("bundle", "views"), ("rectify", "texels"))] == [3, 3, 3]  # fmt: skip
+            (("merge", "megapixels"), ("bundle", "views"), ("rectify", "texels"),
+             ("heightfield", "texels"))] == [3, 3, 3, 3]  # fmt: skip
     largest = {row["method"]: row for row in stages["merge"] if row["megapixels"] > 0.06}
     ours, bound = largest["noise model, iterated"], largest["bound"]
     # Thirteen thousand pixels a decade tell a deviation to a half per cent.
@@ -471,13 +473,18 @@ def test_stages_of_a_calibration_are_measured_by_themselves_and_kept(tmp_path, c
                 if row["texels"] == 16 and row["tilt, degrees"] == 0}  # fmt: skip
     assert straight["ewa"]["dB to Gaussians"] > straight["bilinear"]["dB to Gaussians"] + 10
     assert straight["area"]["dB to areas"] > straight["bilinear"]["dB to areas"] + 5
+    largest = {row["source"]: row for row in stages["heightfield"] if row["texels"] == 24}
+    # 100 steps of a model leave a third of a texel; light sees what it does not
+    assert largest["all three"]["filtered, half"] < 0.6 * largest["a model's"]["filtered, half"]
+    assert largest["all three"]["cpu_s"] > largest["a model's"]["cpu_s"]
     page = (tmp_path / "out" / "bench.md").read_text()
     assert "## Merging" in page
+    assert "## Heights of traced cobbles" in page
     assert "| hat weights |" in page
     # What is there is not measured again, and other sizes do not mix with it.
     kept = (tmp_path / "out" / "stages" / "merge.json").stat().st_mtime_ns
     assert run_cli(btfkit, line) == 0
     assert (tmp_path / "out" / "stages" / "merge.json").stat().st_mtime_ns == kept
-    line = [*line[:4], "--size", "48", "--directions", "12", *line[5:]]
+    line = [*line[:5], "--size", "48", "--directions", "12", *line[6:]]
     assert run_cli(btfkit, line) == 1
     assert "was measured with" in capsys.readouterr().err

@@ -13,11 +13,13 @@ from btfkit.btf import BTF
 from btfkit.cli import btfkit as command
 from btfkit.cli.outcome import run
 from btfkit.errors import FitError
-from btfkit.fitting.heightfield import find_relief
-from btfkit.fitting.heightfield.accuracy import against_truth
+from btfkit.fitting.heightfield import find_heights, find_relief
+from btfkit.fitting.heightfield.accuracy import against_truth, errors_of_heights, truth_of
+from btfkit.fitting.heightfield.alone import by_light, by_parallax
 from btfkit.fitting.heightfield.bounds import shadow_bounds
 from btfkit.fitting.heightfield.fusion import fuse
-from btfkit.fitting.heightfield.parallax import sweep
+from btfkit.fitting.heightfield.orientation import check_lights, check_shadows, check_views
+from btfkit.fitting.heightfield.parallax import heights_of, sweep
 from btfkit.io.store import writer
 from btfkit.relief import file, procedural, synth
 from btfkit.relief.photometric import photometric_stereo
@@ -112,6 +114,129 @@ def test_a_flat_sample_skips_parallax_and_has_no_relief() -> None:
     assert "moves by less than" in found.figures["skipped"]
     # Depth 0: what is left is noise of slopes, added up.
     assert np.abs(found.relief.height).max() * SIZE < 0.1
+
+
+def turned(directions: np.ndarray, turn: list[list[int]]) -> np.ndarray:
+    flat = directions[:, :2] @ np.array(turn).T
+    return np.concatenate([flat, directions[:, 2:]], axis=1).astype(np.float32)
+
+
+TURNS = {
+    "x and y exchanged": [[0, 1], [1, 0]],
+    "turned by -?90 degrees": [[0, -1], [1, 0]],
+    "y turned around": [[1, 0], [0, -1]],
+}
+
+
+@pytest.mark.parametrize("name", TURNS)
+def test_lights_of_the_wrong_hand_are_told_by_curl(name: str, knit: tuple[Relief, BTF]) -> None:
+    btf = frontal(knit[1])
+    stack = read_stack(replace(btf, light=turned(btf.light, TURNS[name])))
+    with pytest.raises(FitError, match=f"the lights are (mirrored|turned): .* {name}"):
+        check_lights(photometric_stereo(stack), wrap=True)
+
+
+def test_views_of_the_wrong_hand_are_told_by_parallax(knit: tuple[Relief, BTF]) -> None:
+    btf = knit[1]
+    normals = photometric_stereo(read_stack(frontal(btf)))
+    stack = read_stack(replace(btf, view=turned(btf.view, TURNS["x and y exchanged"])))
+    with pytest.raises(FitError, match=r"the views are turned: .* x and y exchanged"):
+        check_views(stack.for_parallax(), normals)
+
+
+def test_a_half_turn_of_everything_is_told_by_shadows() -> None:
+    """It makes hills of valleys: neither curl nor parallax says which."""
+    relief = procedural.make("cobbles", SIZE, relief_texels=2.5)
+    btf = frontal(synth.relief_btf(relief, lights="14", views="1", samples=2))
+    few = read_stack(btf)
+    check_shadows(few, photometric_stereo(few))
+    around = replace(btf, light=btf.light * np.float32([-1, -1, 1]))
+    with pytest.raises(FitError, match=r"should lie in shadow has .* of the light"):
+        find_relief(around, holdout=0.0)
+
+
+def test_missing_directions_leave_a_relief(knit: tuple[Relief, BTF]) -> None:
+    """Half of the pairs at random, and a quarter of the sky that no light comes from."""
+    relief, btf = knit
+    keep = np.random.default_rng(0).random(len(btf)) < 0.5
+    keep &= ~((btf.light[:, 0] > 0.2) & (btf.light[:, 1] > 0.2))
+    part = btf.subset(keep)
+    rng = np.random.default_rng(0)
+    start = relief.height * SIZE + rng.normal(0, 0.3, (SIZE, SIZE)).astype(np.float32)
+    _, solved = find_heights(part, start=start)
+    assert solved.why is None
+    half = np.ones((SIZE, SIZE), bool)
+    errors = {
+        k: errors_of_heights(h, relief, half)["rms_filtered"] for k, h in solved.heights.items()
+    }
+    # a quarter of the pairs of the whole, which has 0.2
+    assert errors["fusion"] < 0.3
+    assert errors["fusion"] < errors["model"]
+
+
+def test_saturated_texels_cost_no_relief(knit: tuple[Relief, BTF]) -> None:
+    relief, btf = knit
+    images = btf.batch(np.arange(len(btf)))
+    clipped = replace(btf, textures=np.minimum(images, np.quantile(images, 0.97)))
+    found = find_relief(frontal(clipped), holdout=0.0)
+    assert found.figures["saturated"] > 0.01
+    assert against_truth(found, relief)["heights"]["normals"]["rms"] < 0.4
+
+
+def test_the_relief_that_a_traced_btf_names_is_its_truth(
+    knit: tuple[Relief, BTF], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    relief, btf = knit
+    truth = truth_of(btf)
+    assert truth is not None
+    np.testing.assert_array_equal(truth.height, relief.height)
+    # pictures that were turned since, windows, and names that nothing answers to
+    images = btf.batch(np.arange(len(btf)))
+    assert truth_of(replace(btf, textures=images[:, ::-1].copy())) is None
+    assert truth_of(btf.crop(slice(0, 16), slice(0, 16))) is None
+    recipe = {**relief.provenance["procedural"], "name": "nothing"}
+    assert truth_of(replace(btf, provenance={"procedural": recipe})) is None
+    store = tmp_path / "k.btf.zarr"
+    writer.write(frontal(btf), store)
+    words = ["heightfield", str(store), "-o", str(tmp_path / "k.exr"), "--no-preview", "--json"]
+    assert run(command, words) == 0
+    figures = json.loads(capsys.readouterr().out.strip().split("\n")[-1])
+    assert figures["truth"]["known_by"] == "provenance"
+    assert figures["truth"]["heights"]["normals"]["rms"] < 0.4
+
+
+def test_light_alone_and_parallax_alone_find_the_relief(knit: tuple[Relief, BTF]) -> None:
+    relief, btf = knit
+    stack, half = read_stack(btf), np.ones((SIZE, SIZE), bool)
+    rng = np.random.default_rng(0)
+    start = relief.height * SIZE + rng.normal(0, 0.4, (SIZE, SIZE)).astype(np.float32)
+    light = errors_of_heights(by_light(stack.for_normals())[1].height, relief, half, absolute=False)
+    parallax = errors_of_heights(by_parallax(stack.for_parallax(), start), relief, half)
+    assert light["rms_filtered"] < 0.2
+    assert parallax["rms_filtered"] < 0.25
+
+
+@pytest.mark.slow
+def test_sbtf_of_a_measured_btf_takes_its_relief_and_says_so(knit: tuple[Relief, BTF]) -> None:
+    from btfkit.fitting.fit import fit
+
+    relief, btf = knit
+    report = fit(btf, model="sbtf", steps=60, holdout=0.05, settings={"levels": 1}, device="cpu")
+    assert any("the relief of these pictures by light, parallax and shadows" in c
+               for c in report.choice)  # fmt: skip
+    assert "light, parallax and shadows" in report.untrained[0]
+    heights = heights_of(report.material)
+    error = np.sqrt(np.mean(np.square(heights - relief.height * SIZE)))
+    # as the fusion: the plane is the BTF's, nothing is moved under its highest point
+    assert error < 0.3
+    plain = fit(
+        btf, model="sbtf", steps=1, holdout=0.0, settings={"levels": 1, "heights": "found"},
+        device="cpu",
+    )  # fmt: skip
+    assert not any("relief" in c for c in plain.choice)
+    single = fit(frontal(btf), model="sbtf", steps=1, holdout=0.0, settings={"levels": 1})
+    assert any("no relief was found before (parallax and fusion: there is one view" in c
+               for c in single.choice)  # fmt: skip
 
 
 def test_mirrored_lights_are_told_by_curl(knit: tuple[Relief, BTF]) -> None:

@@ -168,3 +168,18 @@ def test_values_that_are_no_numbers_are_counted_and_cost_no_texel() -> None:
     assert np.isfinite(normals.slope).all()
     assert normals.confidence[5, 5] == 0
     assert np.median(off(normals.slope, relief)) < 1.0
+
+
+def test_many_values_lie_on_disk_and_give_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    btf = frontal(bumps(), LIGHTS[:20], samples=1)
+    inside = read_stack(btf)
+    monkeypatch.setattr("btfkit.relief.stack._MOST_BYTES", 1000)
+    outside = read_stack(btf)
+    assert isinstance(outside.values, np.memmap)
+    assert isinstance(outside.grey, np.memmap)
+    assert len(outside.pairs) == 20
+    part = np.arange(20) % 2 == 0
+    np.testing.assert_array_equal(outside.subset(part).values, inside.subset(part).values)
+    np.testing.assert_array_equal(
+        photometric_stereo(outside).slope, photometric_stereo(inside).slope
+    )

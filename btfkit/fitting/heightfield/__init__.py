@@ -18,7 +18,7 @@ from btfkit.btf import BTF, Wrap
 from btfkit.fitting.analytic import Maps, fit_maps
 from btfkit.fitting.heightfield import orientation
 from btfkit.fitting.heightfield.alone import SWEEPS, by_light
-from btfkit.fitting.heightfield.bounds import shadow_bounds
+from btfkit.fitting.heightfield.bounds import Bounds, shadow_bounds
 from btfkit.fitting.heightfield.fusion import Fused, fuse
 from btfkit.fitting.heightfield.parallax import Sweep, disagreement, fitted_heights, reached, sweep
 from btfkit.heldout import split
@@ -101,13 +101,9 @@ def find_relief(
     began, cpu = time.perf_counter(), time.process_time()
     train, held = _split(len(btf), holdout, seed)
     btf = btf.subset(train)
-    stack = read_stack(btf, progress=progress)
-    check_lights(stack)
-    why = _no_parallax(btf, stack)
-    if why is None:
-        solved = _with_parallax(btf, stack, budget_s, start, bounded, seed, progress)
-    else:
-        solved = _from_normals(stack)
+    stack, solved = find_heights(
+        btf, budget_s=budget_s, start=start, bounded=bounded, seed=seed, progress=progress
+    )
     height = solved.heights[solved.best]
     lit, seen = (reached(height, d, wrap=stack.wrap) for d in (stack.lights, stack.views))
     sure = np.isfinite(solved.deviation)
@@ -127,7 +123,7 @@ def find_relief(
     )  # fmt: skip
     figures = {
         "source": solved.best,
-        "skipped": why,
+        "skipped": solved.why,
         "pairs": len(stack.pairs),
         "lights": len(stack.lights),
         "views": len(stack.views),
@@ -139,7 +135,7 @@ def find_relief(
         "unmeasured": stack.unmeasured / (math.prod(stack.size) * len(stack.pairs)),
         "unexplained": float(1 - np.mean(solved.normals.kept)),
         "range_texels": float(np.ptp(height)),
-        "offset_texels": float(height.mean()) if why is None else 0.0,
+        "offset_texels": float(height.mean()) if solved.why is None else 0.0,
         "clipped_albedo": maps.clipped,
         **solved.figures,
         "seconds": time.perf_counter() - began,
@@ -153,13 +149,58 @@ def find_relief(
 
 @final
 @dataclass(frozen=True, eq=False)
-class _Solved:
+class Solved:
+    """Heights of each source, before reflectance is fitted to them.
+
+    Attributes: as of `Found`, and
+        best: the source that heights are taken from. curl: of the slopes, 1/texel.
+        why: why parallax and fusion were left out; None where they were not.
+    """
+
     normals: Normals
     heights: Mapping[str, Array]
     best: str
     deviation: Array
     curl: float
     figures: Mapping[str, Any] = field(default_factory=dict)
+    why: str | None = None
+
+
+def find_heights(
+    btf: BTF,
+    *,
+    budget_s: float = 20.0,
+    steps: int | None = None,
+    limit_s: float | None = None,
+    start: Array | None = None,
+    bounded: bool = True,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[Stack, Solved]:
+    """What was read of a BTF, and heights from it; arguments and errors as of `find_relief`.
+
+    Args:
+        steps: of the model that parallax begins with, in place of `budget_s`.
+        limit_s: wall time after which no round begins but the first.
+    """
+    began = time.perf_counter()
+    stack = read_stack(btf, progress=progress)
+    check_lights(stack)
+    why = _no_parallax(btf, stack)
+    if why is not None:
+        return stack, replace(_from_normals(stack), why=why)
+    few, many = stack.for_normals(), stack.for_parallax()
+    first = photometric_stereo(few)
+    turn = orientation.check_lights(first, wrap=stack.wrap)
+    orientation.check_shadows(few, first)
+    orientation.check_views(many, first)
+    height = start
+    if height is None:
+        height = fitted_heights(
+            of_stack(btf, stack), budget_s=budget_s, steps=steps, seed=seed, progress=progress
+        )
+    ends = None if limit_s is None else began + limit_s
+    return stack, _in_rounds(few, many, height, turn, bounded=bounded, seed=seed, ends=ends)
 
 
 def _split(count: int, holdout: float, seed: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -191,45 +232,44 @@ def _is_flat(stack: Stack) -> bool:
     return float(height.std()) < _FLAT_HEIGHT
 
 
-def _from_normals(stack: Stack) -> _Solved:
+def _from_normals(stack: Stack) -> Solved:
     """Heights from slopes alone, solved again with the relief's own shadows."""
     few = stack.for_normals()
     first = photometric_stereo(few)
     turn = orientation.check_lights(first, wrap=stack.wrap)
+    orientation.check_shadows(few, first)
     normals, whole = by_light(few, first)
     nothing = np.full(stack.size, np.nan, np.float32)
     figures = {"integration_residual": whole.residual}
-    return _Solved(normals, {"normals": whole.height}, "normals", nothing, turn, figures)
+    return Solved(normals, {"normals": whole.height}, "normals", nothing, turn, figures)
 
 
-def _with_parallax(
-    btf: BTF,
-    stack: Stack,
-    budget_s: float,
-    start: Array | None,
+def _in_rounds(
+    few: Stack,
+    many: Stack,
+    height: Array,
+    turn: float,
+    *,
     bounded: bool,
     seed: int,
-    progress: Progress | None,
-) -> _Solved:
-    few, many = stack.for_normals(), stack.for_parallax()
-    first = photometric_stereo(few)
-    turn = orientation.check_lights(first, wrap=stack.wrap)
-    orientation.check_views(many, first)
-    height = start
-    if height is None:
-        height = fitted_heights(
-            of_stack(btf, stack), budget_s=budget_s, seed=seed, progress=progress
-        )
+    ends: float | None,
+) -> Solved:
+    """Normals, sweep and fusion again and again, from heights that a model found."""
     before = disagreement(many, np.zeros_like(height))
     heights = {"model": height}
-    found: tuple[Normals, Sweep, Fused] | None = None
+    found: tuple[Normals, Sweep, Fused, Bounds | None] | None = None
+    done, longest = 0, 0.0
     for step in SWEEPS:
-        before_it = None if found is None else found[0]
-        found = _round(few, many, height, step, before_it, bounded=bounded, seed=seed)
+        now = time.perf_counter()
+        if found is not None and ends is not None and now + longest > ends:
+            break
+        last = None if found is None else found[0]
+        found = _round(few, many, height, step, last, bounded=bounded, seed=seed)
         height = found[2].height
+        done, longest = done + 1, max(longest, time.perf_counter() - now)
     assert found is not None
-    normals, swept, fused = found
-    alone = integrate(normals.slope, slope_weights(normals), wrap=stack.wrap).height
+    normals, swept, fused, bounds = found
+    alone = integrate(normals.slope, slope_weights(normals), wrap=few.wrap).height
     heights |= {"normals": alone + height.mean() - alone.mean(), "parallax": swept.height}
     heights["fusion"] = height
     figures = {
@@ -239,9 +279,13 @@ def _with_parallax(
             f"{a} - {b}": float(np.sqrt(np.median(np.square(heights[a] - heights[b]))))
             for a, b in (("normals", "parallax"), ("normals", "fusion"), ("parallax", "fusion"))
         },
+        "shadows": None if bounds is None else bounds.kept_by(height),
         "expected_error_texels": float(np.median(_expected_error(fused, swept))),
+        "rounds": done,
+        "rounds_planned": len(SWEEPS),
+        "cut": done < len(SWEEPS),
     }
-    return _Solved(normals, heights, "fusion", _expected_error(fused, swept), turn, figures)
+    return Solved(normals, heights, "fusion", _expected_error(fused, swept), turn, figures)
 
 
 def _round(
@@ -253,17 +297,18 @@ def _round(
     *,
     bounded: bool,
     seed: int,
-) -> tuple[Normals, Sweep, Fused]:
-    """Normals, sweep and fusion around heights, with the relief's own visibility."""
+) -> tuple[Normals, Sweep, Fused, Bounds | None]:
+    """Normals, sweep, fusion and bounds around heights, with the relief's own visibility."""
     lit, looked = (visibility(height, d, wrap=few.wrap) for d in (few.lights, few.views))
     visible = lit[few.light_of] & looked[few.view_of]
     normals = photometric_stereo(few, height=height, visible=visible, start=before)
     swept = sweep(many, height, normals, step=step)
+    bounds = shadow_bounds(few, height, normals) if bounded else None
     fused = fuse(
         normals.slope, normals.variance[..., [0, 2]], swept.height, swept.variance,
-        wrap=few.wrap, bounds=shadow_bounds(few, height, normals) if bounded else None, seed=seed,
+        wrap=few.wrap, bounds=bounds, seed=seed,
     )  # fmt: skip
-    return normals, swept, fused
+    return normals, swept, fused, bounds
 
 
 def _expected_error(fused: Fused, swept: Sweep) -> Array:
@@ -273,7 +318,9 @@ def _expected_error(fused: Fused, swept: Sweep) -> Array:
 
 
 def of_stack(btf: BTF, stack: Stack) -> BTF:
-    """The pairs of a stack, which lie in memory already."""
+    """The pairs of a stack, from memory where they lie there."""
+    if isinstance(stack.values, np.memmap):
+        return btf.subset(stack.pairs)
     textures = as_textures(np.ascontiguousarray(stack.values.transpose(2, 0, 1, 3)))
     return replace(btf.subset(stack.pairs), textures=textures, validity=None, variance=None)
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
-from btfkit.btf import BTF
 from btfkit.fitting.heightfield.bounds import shadow_bounds
 from btfkit.fitting.heightfield.fusion import fuse
-from btfkit.fitting.heightfield.parallax import fitted_heights, sweep
+from btfkit.fitting.heightfield.parallax import sweep
 from btfkit.relief.integration import Integrated, integrate
 from btfkit.relief.photometric import Normals, photometric_stereo, slope_weights
 from btfkit.relief.stack import Array, Stack, visibility
@@ -17,6 +17,8 @@ _NORMAL_ROUNDS = 1
 SWEEPS = (1.0, 0.5, 0.25, 0.12)
 # Rounds in which shadows carve a plane: each moves a texel as far as its neighbours allow.
 _CARVINGS = 12
+# Deviation of the Gaussian over which heights of parallax alone are averaged, texels.
+_SOFT = 0.5
 
 
 def by_light(stack: Stack, first: Normals | None = None) -> tuple[Normals, Integrated]:
@@ -34,19 +36,19 @@ def by_light(stack: Stack, first: Normals | None = None) -> tuple[Normals, Integ
     return normals, integrate(normals.slope, slope_weights(normals), wrap=stack.wrap)
 
 
-def by_parallax(btf: BTF, stack: Stack, *, budget_s: float, seed: int = 0) -> Array:
-    """(h, w) heights, texels: a fitted model's, then where views agree, whatever the surface faces.
+def by_parallax(stack: Stack, height: Array) -> Array:
+    """(h, w) heights, texels: where views agree, whatever the surface faces.
 
     Args:
-        btf: what the model is fitted to. stack: all views of a few lights. budget_s: of the model.
+        stack: all views of a few lights. height: (h, w) to begin with, as a model finds them.
     """
-    height = fitted_heights(btf, budget_s=budget_s, seed=seed)
-    unknown = np.zeros((*stack.size, 2), np.float32)
+    mode = "wrap" if stack.wrap else "nearest"
     for step in SWEEPS:
         swept = sweep(stack, height, None, step=step)
-        height = fuse(
-            unknown, np.full_like(unknown, np.inf), swept.height, swept.variance, wrap=stack.wrap
-        ).height
+        # What no views see keeps the height of what they do see beside it.
+        by = 1 / np.maximum(swept.variance, 1e-6) + 1e-6
+        shares = (gaussian_filter(part, _SOFT, mode=mode) for part in (by * swept.height, by))
+        height = np.divide(*shares).astype(np.float32)
     return height
 
 

@@ -26,6 +26,8 @@ _GRAZING = 0.2
 _RANK = 2
 # Share of the views that has to see a texel before its light bounds it from below.
 _OPEN = 0.6
+# Shadows' edges are as soft as a footprint, texels.
+SOFT_EDGE = 0.3
 # Steps along a shadow line, texels, and at most.
 _STEP, _MOST_STEPS = 0.75, 64
 
@@ -36,6 +38,19 @@ class Bounds(NamedTuple):
     lower: Array
     upper: Array
 
+    def kept_by(self, height: Array) -> dict[str, float]:
+        """Shares of texels that are bounded, and of those that lie beyond, by more than a shadow's
+        edge is wide, and how far these do in the mean, texels.
+        """
+        bounded = np.isfinite(self.lower) | np.isfinite(self.upper)
+        beyond = np.maximum(np.maximum(self.lower - height, height - self.upper), 0)
+        broken = beyond > SOFT_EDGE
+        return {
+            "bounded": float(bounded.mean()),
+            "broken": float(broken.sum() / max(int(bounded.sum()), 1)),
+            "broken_by_texels": float(beyond[broken].mean()) if broken.any() else 0.0,
+        }
+
 
 def shadow_bounds(stack: Stack, height: Array, normals: Normals) -> Bounds:
     """Bounds by what a stack shows in light and in shadow.
@@ -45,7 +60,7 @@ def shadow_bounds(stack: Stack, height: Array, normals: Normals) -> Bounds:
         normals: fitted there.
     """
     h, w = stack.size
-    share, facing = _lit_share(stack, height, normals)
+    share, facing = lit_share(stack, height, normals)
     lines = np.stack([_shadow_line(height, light, wrap=stack.wrap) for light in stack.lights])
     lit = (share > _LIT) & facing
     dark = (share < _DARK) & facing
@@ -62,7 +77,7 @@ def shadow_bounds(stack: Stack, height: Array, normals: Normals) -> Bounds:
     )
 
 
-def _lit_share(stack: Stack, height: Array, normals: Normals) -> tuple[Floats, NDArray[np.bool_]]:
+def lit_share(stack: Stack, height: Array, normals: Normals) -> tuple[Floats, NDArray[np.bool_]]:
     """(k, h, w) of each light: its values in parts of the model's; whether it faces the surface."""
     h, w = stack.size
     seen = visibility(height, stack.views, wrap=stack.wrap)

@@ -13,7 +13,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit.fitting.heightfield.bounds import Bounds
+from btfkit.fitting.heightfield.bounds import SOFT_EDGE, Bounds
 from btfkit.relief.integration import System, softened, system_of
 from btfkit.relief.photometric import SLOPE_ERROR
 
@@ -23,8 +23,6 @@ Floats = NDArray[Any]
 _ROUNDS = 4
 # A height so many deviations off counts half.
 _HALF = 2.5
-# Deviation of a bound: shadows' edges are as soft as a footprint.
-_BOUND = 0.3
 _SAMPLES = 6
 # Median of a squared normal number of variance 1; and no source gains more than this.
 _MEDIAN_SQUARE, _LEAST_SCALE = 0.4549, 0.3
@@ -107,7 +105,7 @@ def _bounded(system: System, height: Floats, bounds: Bounds | None) -> System:
         return system
     low, high = height < bounds.lower, height > bounds.upper
     at = np.where(low, bounds.lower, np.where(high, bounds.upper, 0.0))
-    by = np.where(low | high, 1 / _BOUND**2, 0.0)
+    by = np.where(low | high, 1 / SOFT_EDGE**2, 0.0)
     both = system.by_known + by
     known = (system.by_known * system.known + by * at) / np.maximum(both, 1e-30)
     return replace(system, known=known, by_known=both)

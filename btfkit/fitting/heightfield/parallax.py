@@ -19,7 +19,7 @@ from btfkit.errors import FitError
 from btfkit.materials.base import Material
 from btfkit.native.lobe import shaded
 from btfkit.relief.photometric import Normals
-from btfkit.relief.stack import Stack, visibility
+from btfkit.relief.stack import Stack, slopes, visibility
 
 Array = NDArray[np.float32]
 Floats = NDArray[Any]
@@ -49,9 +49,14 @@ class Sweep:
 
 
 def fitted_heights(
-    btf: BTF, *, budget_s: float, seed: int = 0, progress: Callable[[int, int], None] | None = None
+    btf: BTF,
+    *,
+    budget_s: float = 20.0,
+    steps: int | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Array:
-    """(h, w) heights in texels that a `neumip` finds within some seconds of training.
+    """(h, w) heights in texels that a `neumip` finds within some seconds, or steps, of training.
 
     Raises:
         FitError: no usable data.
@@ -60,7 +65,7 @@ def fitted_heights(
 
     settings = {"levels": "1", "precision": "float32"}
     report = fit(
-        btf, model="neumip", budget_s=budget_s, holdout=0.0, seed=seed, device="cpu",
+        btf, model="neumip", budget_s=budget_s, steps=steps, holdout=0.0, seed=seed, device="cpu",
         settings=settings, progress=progress,
     )  # fmt: skip
     return heights_of(report.material)
@@ -154,6 +159,7 @@ def _disagreement(
     """(h, w) squares left over, degrees of freedom, and squares in all, a texel."""
     h, w = stack.size
     grey = stack.grey
+    slope = slopes(height, wrap=stack.wrap) if normals is None else normals.slope
     parts = []
     for rows in _blocks(h, w, len(stack.pairs)):
         values = stack.seen(grey, height + np.float32(look), rows)[..., 0]
@@ -161,22 +167,25 @@ def _disagreement(
         use = seen[:, rows].reshape(len(seen), -1).T[:, stack.view_of] & np.isfinite(values)
         values = np.where(use, values, 0)
         model = np.where(use, model, 0)
-        parts.append(_by_light(stack, values, model, use))
+        weight = use * stack.shown(slope[rows].reshape(-1, 2))
+        parts.append(_by_light(stack, values, model, weight))
     return tuple(np.concatenate(column).reshape(h, w) for column in zip(*parts, strict=True))  # type: ignore[return-value]
 
 
 def _by_light(
-    stack: Stack, values: Array, model: Array, use: NDArray[np.bool_]
+    stack: Stack, values: Array, model: Array, weight: Array
 ) -> tuple[Floats, Floats, Floats]:
     """(t,) sums over lights: what no multiple of the model explains, freedom, squares."""
     lights = np.eye(len(stack.lights), dtype=np.float32)[stack.light_of]
-    vm, mm, vv = (part @ lights for part in (values * model, model * model, values * values))
-    views = use.astype(np.float32) @ lights
-    several = views > 1
+    heavy = weight * values
+    vm, mm, vv = (part @ lights for part in (heavy * model, weight * model * model, heavy * values))
+    # Weighted views count as so many equal ones.
+    views = np.square(weight @ lights) / np.maximum(np.square(weight) @ lights, 1e-12)
+    several = (weight > 0).astype(np.float32) @ lights > 1
     left = np.where(several, vv - np.square(vm) / np.maximum(mm, 1e-9), 0)
     return (
         np.maximum(left, 0).sum(axis=1),
-        np.where(several, views - 1, 0).sum(axis=1),
+        np.where(several, np.maximum(views - 1, 0), 0).sum(axis=1),
         np.where(several, vv, 0).sum(axis=1),
     )
 

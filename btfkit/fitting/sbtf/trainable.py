@@ -118,11 +118,14 @@ class SBTF(Marching[Settings]):
             self._keep_given()
 
     def know(self, relief: Relief) -> None:
-        """Take the heights, and the holes, of the relief behind the data, its top at 0."""
+        """Take the heights, and the holes, of the relief behind the data; of queries, top at 0."""
         if self.settings.heights == "found":
             return
         wrap = relief.wrap == "wrap"
-        height = relief.under_surface()[0].height / np.float32(self.spec.depth_scale)
+        # A BTF's plane is where it was measured; what is traced lies under its highest point.
+        measured = isinstance(self._data, BTF)
+        under = relief if measured else relief.under_surface()[0]
+        height = under.height / np.float32(self.spec.depth_scale)
         self._given = resized(height, self.spec.size, wrap=wrap).astype(np.float32)
         if self.spec.holes and relief.opacity is not None:
             opacity = resized(relief.opacity, self.spec.size, wrap=wrap)
@@ -151,7 +154,8 @@ class SBTF(Marching[Settings]):
         source = self._data
         if not isinstance(source, BTF) and source.curvature is not None and source.curvature.any():
             return ()
-        heights = "a known relief" if self._given is not None else "the parallax of its views"
+        given = "light, parallax and shadows" if isinstance(source, BTF) else "a known relief"
+        heights = given if self._given is not None else "the parallax of its views"
         return (
             "curved surfaces: nothing was measured there; outlines and displaced places are those "
             f"of heights from {heights}, colours those of the plane where a ray ends",
