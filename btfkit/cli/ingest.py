@@ -118,7 +118,13 @@ def ingest_verb(
         with connected(cluster) as workers:
             bar.phase("reading and writing")
             return told(ingest_all(workers, targets, Asked(given, dtype, force, closing), bar))
-    writing = {"dtype": dtype, "jobs": jobs, "force": force, "progress": bar, "phase": bar.phase}
+    writing: dict[str, Any] = {
+        "dtype": dtype,
+        "jobs": jobs,
+        "force": force,
+        "progress": bar,
+        "phase": bar.phase,
+    }
     source = the_one(sources, "sources")
     if options["relief"] != _FOUND:
         return _written(ingest(source, out, **writing, **given), preview=preview)

@@ -24,6 +24,7 @@ from btfkit.fitting.heightfield.parallax import fitted_heights
 from btfkit.relief import procedural, synth
 from btfkit.relief.relief import Relief
 from btfkit.relief.stack import Stack, chosen, read_stack
+from btfkit.textures import ArrayTextures
 
 MATERIAL = "cobbles"
 # Texels a side, directions, and steps of the model that parallax begins with.
@@ -63,7 +64,7 @@ def _traced(truth: Relief, directions: str) -> BTF:
     """The pairs that are read, traced."""
     lazy = synth.relief_btf(truth, lights=directions, views=directions)
     btf = lazy.subset(np.sort(chosen(lazy)))
-    return replace(btf, textures=btf.batch(np.arange(len(btf))))
+    return replace(btf, textures=ArrayTextures(btf.batch(np.arange(len(btf)))))
 
 
 Height = NDArray[np.float32]
