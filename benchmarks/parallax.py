@@ -38,11 +38,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sample", default="woven")
     parser.add_argument("--seed", type=int, default=8)
+    parser.add_argument("--small", action="store_true", help="320 x 240")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         here = Path(folder)
         run = here / "run"
-        twin = Twin(given.sample, 480, 360, given.seed, everything())
+        size = (320, 240) if given.small else (480, 360)
+        twin = Twin(given.sample, *size, given.seed, everything())
         log = TwinLog(run, twin)
         rig = mock.open_rig(log.begin(), log=log)
         measure(rig, from_document("parallax", PLAN), run, synthetic=True)
@@ -54,14 +56,19 @@ def main() -> None:
                 run, here / "true.btf.zarr", options={**flat, "relief": here / "true.exr"}
             ),
         }
-        stores["on the found one"], _ = ingest_on_found_relief(run, here / "found.btf.zarr")
         for name, store in stores.items():
-            high, left = _explained(btfkit.open(store))
-            print(
-                f"{name}: {np.sqrt((left**2).sum(1).mean()):.4f} texels rms beside a height of "
-                f"{high:.3f} texels, {np.linalg.norm(left, axis=1).max():.4f} at most",
-                flush=True,
-            )
+            _say(name, store)
+        store, _ = ingest_on_found_relief(run, here / "found.btf.zarr")
+        _say("on the found one", store)
+
+
+def _say(name: str, store: Any) -> None:
+    high, left = _explained(btfkit.open(store))
+    print(
+        f"{name}: {np.sqrt((left**2).sum(1).mean()):.4f} texels rms beside a height of "
+        f"{high:.3f} texels, {np.linalg.norm(left, axis=1).max():.4f} at most",
+        flush=True,
+    )
 
 
 def _explained(btf: Any) -> tuple[float, Any]:
