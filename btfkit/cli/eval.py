@@ -117,14 +117,13 @@ def _reported(
     final: Path, material: Material, truth: BTF | QuerySet, rows: Any, said: dict[str, Any],
     bar: Bar, *, force: bool,
 ) -> Path:  # fmt: skip
-    from btfkit.btf import BTF
     from btfkit.files import whole
     from btfkit.view import report
 
     figures = {k: v for k, v in said.items() if k not in ("held_out", "levels")}
     text = report.page(
         material, title=f"{stem(said['model'])}: errors", figures=figures,
-        btf=truth if isinstance(truth, BTF) else None, pairs=rows, progress=bar,
+        truth=truth, rows=rows, progress=bar,
     )  # fmt: skip
     with whole(final, force=force) as partial:
         partial.write_text(text, encoding="utf-8")

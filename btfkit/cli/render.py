@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +26,7 @@ from btfkit.remote import Location
 
 if TYPE_CHECKING:
     from btfkit.materials.base import Material
-    from btfkit.render.preview import Rendering
+    from btfkit.render.look import Look
     from btfkit.render.shot import Shot
 
 _ANGLES = NumbersType("THETA,PHI", float)
@@ -104,8 +103,9 @@ def render_verb(
     Without --light, --panel and --env a studio lights it: key, fill and rim light before grey.
     An interruption keeps the rays that were finished.
     """
-    from btfkit.files import refuse_existing
+    from btfkit.files import refuse_existing, whole
     from btfkit.render import animation, picture
+    from btfkit.render.look import Look
 
     start = time.perf_counter()
     if sum(each is not None for each in (compare, sweep, pairs)) > 1:
@@ -133,12 +133,13 @@ def render_verb(
         from btfkit.render.confidence import Confidence
 
         material = Confidence(material)
-    look = _Look(material.header.channels, exposure, background or shot.background)
+    look = Look(material.header.channels, exposure, background or shot.background)
     if sweep:
         shots = animation.shots(shot, sweep, frames, material)
         seen = [look.codes(each) for each in animation.frames(shots, material, bar)]
         made: dict[str, Any] = {"sweep": sweep, "frames": frames, "fps": fps}
-        _write(final, lambda path: animation.write(path, seen, fps=fps), force)
+        with whole(final, force=force) as partial:
+            animation.write(partial, seen, fps=fps)
     elif pairs:
         made = _pairs_sheet(material, look, pairs, final, bar, force)
     elif compare:
@@ -162,7 +163,7 @@ def render_verb(
 
 
 def _still(
-    source: Location, material: Material, shot: Shot, look: _Look, final: Path, bar: Bar,
+    source: Location, material: Material, shot: Shot, look: Look, final: Path, bar: Bar,
     force: bool, start: float, guessed: Guessed,
 ) -> Outcome:  # fmt: skip
     from btfkit.render import picture, studio
@@ -197,7 +198,7 @@ def _still(
 
 
 def _comparison(
-    source: Location, material: Material, compare: Location, shot: Shot, look: _Look,
+    source: Location, material: Material, compare: Location, shot: Shot, look: Look,
     final: Path, bar: Bar, force: bool,
 ) -> dict[str, Any]:  # fmt: skip
     """Writes two materials side by side and their difference; the figures."""
@@ -220,60 +221,20 @@ def _comparison(
     sheet = sheets.side_by_side(
         (look.linear(first), look.linear(second)), (stem(source), stem(compare)), figures
     )
-    look.write(sheet, final, force)
+    look.write(sheet, final, force=force)
     return {"compare": compare, "spp": first.samples, **figures}
 
 
 def _pairs_sheet(
-    material: Material, look: _Look, count: int, final: Path, bar: Bar, force: bool
+    material: Material, look: Look, count: int, final: Path, bar: Bar, force: bool
 ) -> dict[str, Any]:
     from btfkit.render import sheets
 
     sheet, angles = sheets.direction_pairs(
         material, look.to_rgb, count=count, exposure=look.exposure, progress=bar
     )
-    look.write(sheet, final, force)
+    look.write(sheet, final, force=force)
     return {"pairs": count, "directions_deg": angles}
-
-
-class _Look:
-    """How radiance is shown: its colours, exposed, over a background."""
-
-    def __init__(self, channels: tuple[str, ...], exposure: float, background: Any) -> None:
-        self.channels, self.exposure, self.background = channels, exposure, background
-
-    @property
-    def to_rgb(self) -> Any:
-        """(c, 3) from channels to linear RGB."""
-        from btfkit.render import picture
-
-        return picture.to_rgb(self.channels)
-
-    def linear(self, seen: Rendering) -> Any:
-        """(h, w, 3) linear RGB as shown."""
-        import numpy as np
-
-        shown = seen.radiance @ self.to_rgb * np.float32(2.0**self.exposure)
-        return shown + (1 - seen.cover[..., None]) * np.asarray(self.background, np.float32)
-
-    def codes(self, seen: Rendering) -> Any:
-        """(h, w, 3) 8-bit sRGB."""
-        from btfkit.render import sheets
-
-        return sheets.codes_of(self.linear(seen))
-
-    def write(self, codes: Any, final: Path, force: bool) -> None:
-        """Write 8-bit sRGB as PNG or JPEG."""
-        from PIL import Image
-
-        _write(final, lambda path: Image.fromarray(codes).save(path, quality=95), force)
-
-
-def _write(final: Path, write: Callable[[Path], None], force: bool) -> None:
-    from btfkit.files import whole
-
-    with whole(final, force=force) as partial:
-        write(partial)
 
 
 def _shot(size: tuple[int, int] | None, *, spp: int | None, **chosen: Any) -> Shot:

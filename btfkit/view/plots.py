@@ -31,8 +31,12 @@ def png_of(codes: NDArray[np.uint8]) -> bytes:
     return buffer.getvalue()
 
 
-def by_angle(light: Floats, view: Floats, psnr: Floats) -> bytes:
-    """PSNR of pairs (n,) over the discs of light and view, the worst on top, and by angle."""
+def by_angle(light: Floats, view: Floats, psnr: Floats, *, what: str = "pairs") -> bytes:
+    """PSNR of pairs (n,) over the discs of light and view, the worst on top, and by angle.
+
+    Args:
+        what: each of them is called.
+    """
     order = np.argsort(-psnr)
 
     def draw(figure: Figure) -> None:
@@ -42,7 +46,7 @@ def by_angle(light: Floats, view: Floats, psnr: Floats) -> bytes:
             phi = np.arctan2(ways[order, 1], ways[order, 0])
             dots = axes.scatter(phi, theta, c=psnr[order], s=16, cmap="viridis")
             axes.set_rlim(0, 90)
-            axes.set_title(f"{name}: PSNR of pairs, dB", fontsize=9)
+            axes.set_title(f"{name}: PSNR of {what}, dB", fontsize=9)
             axes.tick_params(labelsize=7)
             figure.colorbar(dots, ax=axes, shrink=0.7, pad=0.12).ax.tick_params(labelsize=7)
             flat = figure.add_subplot(1, 4, column + 3)
@@ -56,9 +60,9 @@ def by_angle(light: Floats, view: Floats, psnr: Floats) -> bytes:
     return drawn(draw, (13, 3.2))
 
 
-def by_texel(rmse: Floats) -> bytes:
-    """Root mean square error of each texel (h, w), with its scale."""
-    return _mapped(rmse, "RMSE over the pairs, texel by texel", "magma", rmse.shape)
+def by_texel(rmse: Floats, *, said: str = "RMSE over the pairs, texel by texel") -> bytes:
+    """Root mean square error of each texel (h, w), with its scale, under a title."""
+    return _mapped(rmse, said, "magma", rmse.shape)
 
 
 def heights(tiles: Floats, size: tuple[int, int]) -> bytes:

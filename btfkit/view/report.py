@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import html
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,9 +16,11 @@ from btfkit.materials.base import Material
 from btfkit.materials.evaluation import answer_pair, texel_centres
 from btfkit.materials.explained import explained, program_of, run_time, textures_of
 from btfkit.program import Heights, Program
+from btfkit.queries import QuerySet
 from btfkit.render import sheets, studio
-from btfkit.view import plots
+from btfkit.view import plots, queried
 from btfkit.view.page import section, styled
+from btfkit.view.parts import angles, heading, picture, told
 
 Floats = NDArray[Any]
 # Pairs whose errors by angle and texel are shown; worst pairs; single texels; longest side shown.
@@ -74,8 +75,8 @@ def page(
     *,
     title: str,
     figures: Mapping[str, Any],
-    btf: BTF | None = None,
-    pairs: NDArray[np.intp] | None = None,
+    truth: BTF | QuerySet | None = None,
+    rows: NDArray[np.intp] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> str:
     """One HTML page, readable as a file: no script, nothing from elsewhere, names escaped.
@@ -83,24 +84,26 @@ def page(
     Args:
         material: the model. title: of the page.
         figures: names and values that stand on top: what was compared, and its errors.
-        btf, pairs: the measurement, and which of it to compare; None of a query file, whose
-            errors have no place on the page but in `figures`.
+        truth: the measurement, or queries with answers. rows: which of its pairs, or queries, to
+            compare; None is all.
     """
-    parts = [_told(figures)]
-    if btf is not None:
-        parts += _against(material, btf, compared(material, btf, pairs, progress=progress))
+    parts = [told(figures)]
+    if isinstance(truth, BTF):
+        parts += _against(material, truth, compared(material, truth, rows, progress=progress))
+    elif truth is not None:
+        parts += queried.against(material, truth, rows)
     program = program_of(material)
     parts += [
-        _heading("How it looks"),
-        _picture(studio.picture(material, size=_SIDE), "on a sphere"),
+        heading("How it looks"),
+        picture(studio.picture(material, size=_SIDE), "on a sphere"),
     ]
     if material.has_levels:
         parts.append(_levels(material))
     if program is not None:
         parts += _inside(program)
-    parts += [_heading("What it is made of"), _told(explained(material))]
+    parts += [heading("What it is made of"), told(explained(material))]
     spent = {f"{k}, CPU ns a query": round(v, 1) for k, v in run_time(material).items()}
-    parts += [_heading("Run time"), _told(spent)]
+    parts += [heading("Run time"), told(spent)]
     body = section("page.html.txt", "report").replace("@body@", "\n".join(parts))
     return styled(body, title=title)
 
@@ -109,26 +112,26 @@ def _against(material: Material, btf: BTF, found: Compared) -> list[str]:
     measured = np.isfinite(found.psnr) | np.isposinf(found.psnr)
     shown = np.minimum(found.psnr[measured], 100)
     pairs = found.pairs[measured]
-    parts = [_heading("Error by angle")]
+    parts = [heading("Error by angle")]
     if not len(pairs):
         return [*parts, "<p>Nothing of these pairs was measured.</p>"]
     parts.append(
-        _picture(plots.by_angle(btf.light[pairs], btf.view[pairs], shown), "error by angle")
+        picture(plots.by_angle(btf.light[pairs], btf.view[pairs], shown), "error by angle")
     )
     parts += [
         f"<p>{len(found.pairs)} pairs; a dot is one, the worst lie on top.</p>",
-        _heading("Error by texel"),
+        heading("Error by texel"),
     ]
-    parts += [_picture(plots.by_texel(found.rmse), "error by texel"), _heading("Worst pairs")]
+    parts += [picture(plots.by_texel(found.rmse), "error by texel"), heading("Worst pairs")]
     rows, names = [], []
     for k in np.argsort(shown)[:_WORST]:
         pair = int(pairs[k])
         rows.append(_pair_shown(material, btf, pair))
-        light, view = (_angles(ways[pair]) for ways in (btf.light, btf.view))
+        light, view = (angles(ways[pair]) for ways in (btf.light, btf.view))
         names.append(f"pair {pair}: light {light}, view {view}, PSNR {shown[k]:.2f} dB")
     sheet = sheets.table(rows, ("measured", "model", "difference x 4"), names)
-    parts += [_picture(plots.png_of(sheet), "worst pairs"), _heading("Single texels")]
-    parts.append(_picture(_polar(material, btf, found), "reflectance by light"))
+    parts += [picture(plots.png_of(sheet), "worst pairs"), heading("Single texels")]
+    parts.append(picture(_polar(material, btf, found), "reflectance by light"))
     parts.append(
         "<p>Mean of the channels by the light's angle in the plane of azimuth 0 and 180 degrees, "
         "seen from nearest above. Line: the model; dots: measured lights within "
@@ -187,7 +190,7 @@ def _levels(material: Material) -> str:
     said = (
         "<p>Level l blurs by a kernel of deviation 0.5 x 2^l texels; light at 35, 135 degrees.</p>"
     )
-    return _picture(plots.png_of(strip), "levels of detail") + said
+    return picture(plots.png_of(strip), "levels of detail") + said
 
 
 def _inside(program: Program) -> list[str]:
@@ -196,12 +199,12 @@ def _inside(program: Program) -> list[str]:
     if isinstance(program.depth, Heights):
         tiles = program.depth.heights.astype(float) * program.depth.scale
         parts += [
-            _heading("Heights"),
-            _picture(plots.heights(_shrunk(tiles), tiles.shape), "heights"),
+            heading("Heights"),
+            picture(plots.heights(_shrunk(tiles), tiles.shape), "heights"),
         ]
     textures = textures_of(program)
     if textures:
-        parts.append(_heading("Latent channels"))
+        parts.append(heading("Latent channels"))
     for texture in textures:
         finest = _shrunk(np.asarray(texture.levels[0], float))
         low, high = np.quantile(finest, [0.005, 0.995], axis=(0, 1))
@@ -214,7 +217,7 @@ def _inside(program: Program) -> list[str]:
         said = [f"{a:.2g}..{b:.2g}" for a, b in zip(low, high, strict=True)]
         ranges = [", ".join(said[k : k + across]) for k in range(0, len(said), across)]
         sheet = sheets.table(rows, [f"{texture.name}, {len(cells)} channels"], ranges)
-        parts.append(_picture(plots.png_of(sheet), texture.name))
+        parts.append(picture(plots.png_of(sheet), texture.name))
     return parts
 
 
@@ -231,40 +234,3 @@ def _shrunk(values: Floats) -> Floats:
 def _shrunk_places(h: int, w: int) -> Floats:
     shrink = max(max(h, w) / _SIDE, 1) * (2 if max(h, w) > _SIDE / 2 else 1)
     return texel_centres(max(round(h / shrink), 1), max(round(w / shrink), 1))
-
-
-def _angles(way: Floats) -> str:
-    theta = math.degrees(math.acos(min(max(float(way[2]), -1), 1)))
-    phi = math.degrees(math.atan2(way[1], way[0])) % 360
-    return f"{theta:.0f}\N{DEGREE SIGN} {phi:.0f}\N{DEGREE SIGN}"
-
-
-def _heading(text: str) -> str:
-    return f"<h2>{html.escape(text)}</h2>"
-
-
-def _picture(png: bytes, said: str) -> str:
-    return f'<p><img alt="{html.escape(said)}" src="{plots.data_uri(png)}"></p>'
-
-
-def _told(values: Mapping[str, Any]) -> str:
-    """Names and values as a table; every text is escaped."""
-    rows = []
-    for name, value in values.items():
-        rows.append(
-            f"<tr><th>{html.escape(str(name))}</th><td>{html.escape(_said(value))}</td></tr>"
-        )
-    return "<table>" + "".join(rows) + "</table>"
-
-
-def _said(value: Any) -> str:
-    if isinstance(value, bool) or value is None:
-        return {True: "yes", False: "no", None: "not known"}[value]
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, Mapping):
-        return "; ".join(f"{name} {_said(each)}" for name, each in value.items())
-    if isinstance(value, (Sequence, np.ndarray)) and not isinstance(value, str):
-        most = [_said(each) for each in list(value)[:12]]
-        return ", ".join(most) + (f", ... ({len(value)})" if len(value) > 12 else "")
-    return str(value)

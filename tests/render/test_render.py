@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from btfkit.errors import FormatError
 from btfkit.io import images
 from btfkit.io.store import writer
 from btfkit.materials.base import Header, Material
+from btfkit.materials.lambert import Lambert, LambertSpec
 from btfkit.queries import Query
 from btfkit.render import picture
 from btfkit.render.environment import Environment
@@ -819,6 +821,41 @@ def test_noise_for_an_obj_is_a_format_error(tmp_path_factory: Any, noise: bytes)
     path.write_bytes(TRIANGLE.encode() + b"f 1/1 2/2 3/3\n" + noise)
     with contextlib.suppress(FormatError):
         assert len(obj.read(path).corner) >= 1
+
+
+@pytest.mark.slow
+def test_a_mesh_of_a_million_triangles_is_read_and_drawn_in_seconds(tmp_path: Path) -> None:
+    n = 709
+    v, u = np.meshgrid(*[np.linspace(0, 1, n, dtype="<f4")] * 2, indexing="ij")
+    height = 0.1 * np.sin(6 * u) * np.cos(5 * v)
+    corners = np.stack([2 * u - 1, 2 * v - 1, height, u, v], axis=-1).astype("<f4")
+    a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)
+    faces = np.empty(2 * len(a), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"] = 3
+    faces["corners"] = np.stack([a, a + 1, a + n + 1, a, a + n + 1, a + n], axis=1).reshape(-1, 3)
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "s", "t"))
+    head = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {n * n}\n{names}"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    (tmp_path / "fine.ply").write_bytes(head.encode() + corners.tobytes() + faces.tobytes())
+    start = time.process_time()
+    form = shape_of(str(tmp_path / "fine.ply"), repeat=4)
+    up = np.array([[0.0, 0.0, 1.0]])
+    white = Lambert(
+        LambertSpec((1, 1)), {"texture": np.ones((1, 1, 3), np.float32)}, Header((1, 1))
+    )
+    seen = render(Scene(white, form, up), size=(64, 64))
+    # Some 8 CPU seconds, the more on a busy machine.
+    assert time.process_time() - start < 60
+    assert len(faces) > 1e6
+    # A square whose corners a ball of 1 holds: 1.41 wide, in a picture of 2.08.
+    assert seen.cover.mean() == pytest.approx(0.5 / 1.04**2, abs=0.03)
+    # The cosine of slopes of 0.1 sin 6u cos 5v, u half a unit of length: 0.92 in the mean.
+    slope = np.gradient(height, 2 / (n - 1))
+    cosine = 1 / np.sqrt(1 + slope[0] ** 2 + slope[1] ** 2)
+    inside = seen.cover == 1
+    assert seen.radiance[inside].mean() == pytest.approx(cosine.mean(), abs=0.005)
 
 
 def test_triangles_without_texture_area_still_have_a_frame(tmp_path: Path) -> None:

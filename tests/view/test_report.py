@@ -88,15 +88,38 @@ def test_a_report_is_one_page_without_scripts_in_which_names_are_text(
 
 def test_a_query_file_has_a_report_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file.save(painted(), tmp_path / "m.safetensors")
-    rng = np.random.default_rng(0)
-    rows = QuerySet(rng.random((50, 2), np.float32), np.tile(UP, (50, 1)), np.tile(UP, (50, 1)),
-                    rgb=np.full((50, 3), 0.25, np.float32))  # fmt: skip
+    rng, n = np.random.default_rng(0), 200
+    light = np.tile(UP, (n, 1))
+    light[7] = [0.6, 0, 0.8]
+    rgb = np.full((n, 3), 0.25, np.float32)
+    rgb[7], rgb[8] = 0.9, np.nan
+    opacity = np.ones(n, np.float32)
+    opacity[:5] = 0
+    rows = QuerySet(
+        rng.random((n, 2), np.float32), light, np.tile(UP, (n, 1)), rgb=rgb, opacity=opacity,
+        footprint=np.repeat([0.5, 4], n // 2).astype(np.float32), size=(8, 8),
+    )  # fmt: skip
     queryfile.write(rows, tmp_path / "q.npz")
     out = tmp_path / "q.html"
     model, queries = str(tmp_path / "m.safetensors"), str(tmp_path / "q.npz")
     assert run(command, ["eval", model, queries, "--report", str(out)]) == 0
-    assert "Error by angle" not in out.read_text()
-    assert "0.0625" in out.read_text()
+    text = out.read_text()
+    # Neither the query without an answer, nor the five where nothing is seen.
+    assert "194 queries; a dot is one of 194" in text
+    # A row for each footprint: 0.25 off, and the first with one that is 0.5 off, of 94.
+    first = 10 * np.log10(94 / (93 * 0.0625 + 0.25))
+    cells = re.findall(r"<td>([^<]*)</td>", text[text.index("Error by footprint") :])
+    assert cells[:6] == ["0.5 to 0.5", "94", f"{first:.6g}", "4 to 4", "100", "12.0412"]
+    seen = re.findall(r"<td>([^<]*)</td>", text[text.index("<h2>Opacity") :])
+    assert seen[:8:2] == [
+        "seen, and the model says so", "seen, but the model says not",
+        "not seen, but the model says so", "not seen, and the model says not",
+    ]  # fmt: skip
+    assert seen[1:8:2] == ["195", "0", "5", "0"]
+    worst = re.findall(r"<td>([^<]*)</td>", text[text.index("Worst queries") :])
+    assert (worst[0], worst[3]) == ("7", "37° 0°")
+    assert worst[6:8] == ["0.9, 0.9, 0.9", "0.4, 0.4, 0.4"]
+    assert len(re.findall(r"data:image/png;base64", text)) >= 3
 
 
 def test_info_says_what_a_model_is_made_of(

@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, final
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from btfkit.conventions import (
-    CURVATURE_UNIT,
-    EPSILON,
-    LEAK,
-    LEVELS_UNIT,
     LOWEST_COSINE,
     LOWEST_SEEN,
     MOST_LOG,
     displacement,
 )
 from btfkit.native.neural.plain import YUV_TO_RGB
-from btfkit.program import Dense, Heights, OffsetNetwork, Program, Texture, frame_products
+from btfkit.program import (
+    DepthNetwork,
+    Heights,
+    OffsetNetwork,
+    Program,
+    Texture,
+    frame_products,
+)
+from btfkit.render.mitsuba import layers
 from btfkit.render.mitsuba.march import Met, on_curved, on_plane, turned
 from btfkit.render.mitsuba.pyramid import Pyramid, Surface
 from btfkit.render.picture import to_rgb
 
 Numbers = list[Any]
-_TOGETHER = 8
 # 38,000 took LLVM nine minutes, 3,000 five seconds.
 MOST_WEIGHTS = 12000
 
@@ -38,12 +39,14 @@ class Seen(NamedTuple):
     Attributes:
         uv, view: as asked. met: where the view ray ends. level: of detail.
         turned: the view in the frame where the ray ends.
-        values: numbers of the textures that no light moves, by name.
+        offset: how far a network moves lookups, u and v. values: numbers of the textures that no
+            light moves, by name.
     """
 
     uv: Numbers
     view: Numbers
     met: Met
+    offset: Numbers
     level: Any
     curvature: Any
     turned: Numbers
@@ -67,13 +70,7 @@ class Evaluation:
 
     def __init__(self, program: Program) -> None:
         found = program.depth
-        if program.cover is not None or isinstance(found, OffsetNetwork):
-            raise TypeError(
-                "this material has networks of opacity and offset of its own, which are not "
-                "traced; expected one whose rays end at heights or by a network of depth"
-            )
-        depth_layers = getattr(found, "layers", ())
-        weights = sum(layer.weight.size for layer in (*program.layers, *depth_layers))
+        weights = sum(layer.weight.size for layer in program.every_layer)
         if weights > MOST_WEIGHTS:
             raise TypeError(
                 f"networks of {weights} weights, each of which becomes an instruction; expected "
@@ -88,8 +85,7 @@ class Evaluation:
             self._holes = None
             if found.opacity is not None:
                 self._holes = Surface(found.opacity, program.wrap)
-        elif found is not None:
-            self._offset = Pyramid(found.texture.levels[:1], program.wrap)
+        self._own = [Pyramid(part.texture.levels[:1], program.wrap) for part in program.networks]
 
     @property
     def passes(self) -> bool:
@@ -97,9 +93,9 @@ class Evaluation:
         return self._program.opacity != "none"
 
     @property
-    def curved(self) -> bool:
-        """Whether curvature bends view rays."""
-        return isinstance(self._program.depth, Heights) and self._program.depth.curved
+    def bends(self) -> bool:
+        """Whether answers depend on curvature."""
+        return self._program.bends
 
     def __call__(
         self,
@@ -126,12 +122,12 @@ class Evaluation:
         program = self._program
         level = dr.log2(2 * dr.clip(footprint, 0.5, 1e30)) if program.leveled else 0 * footprint
         bent = mi.Float(curvature)
-        met = self._met(uv, view, level, bent, active)
+        met, offset = self._met(uv, view, level, bent, active)
         turn = view
-        if self.curved:
+        if self._program.curved:
             turn = turned(view, view, met.turn)
             turn[2] = dr.select(met.turn == 0, turn[2], dr.maximum(turn[2], LOWEST_SEEN))
-        found = Seen(uv, view, met, level, bent, turn, {})
+        found = Seen(uv, view, met, offset, level, bent, turn, {})
         for texture in self._textures:
             if not texture.light:
                 found.values[texture.name] = self._looked_up(texture, found, None, active)
@@ -144,8 +140,8 @@ class Evaluation:
         for texture in self._textures:
             if texture.light:
                 values[texture.name] = self._looked_up(texture, seen, light, active)
-        toward = turned(light, seen.view, seen.met.turn) if self.curved else light
-        known = _known(toward, seen.turned, seen.level, seen.curvature)
+        toward = turned(light, seen.view, seen.met.turn) if self._program.curved else light
+        known = layers.known(toward, seen.turned, seen.level, seen.curvature)
         for texture in program.textures:
             known |= dict(zip(texture.features, values[texture.name], strict=True))
         names = iter(frame_products(program.frames))
@@ -161,13 +157,17 @@ class Evaluation:
             # Zero, not masked: what is masked would be compiled once more.
             lit = (seen.met.opacity > 0) & (toward[2] > 0)
             rgb, opacity = [dr.select(lit, value, 0) for value in rgb], seen.met.opacity
+        if program.opacity == "network":
+            opacity = seen.met.opacity
+            rgb = [dr.select(opacity > 0, value, 0) for value in rgb]
         return rgb, opacity
 
     def place(self, seen: Seen) -> Numbers:
         """Where on the tile the view ray ends, u and v."""
         low = dr.maximum(seen.view[2], LOWEST_COSINE)
         moves = displacement(seen.view[0], seen.view[1], low, self._program.aspect)
-        return [x + seen.met.depth * move for x, move in zip(seen.uv, moves, strict=True)]
+        moved = [x + seen.met.depth * move for x, move in zip(seen.uv, moves, strict=True)]
+        return [x + move for x, move in zip(moved, seen.offset, strict=True)]
 
     def opacity(self, seen: Seen, active: Any) -> Any:
         """Of a view alone, however it is lit."""
@@ -192,39 +192,55 @@ class Evaluation:
         if not first.residual:
             first = replace(first, weight=first.weight[:, order])
             names = tuple(names[k] for k in order)
-        return _run([first, *rest], [known[n] for n in names], rounded=program.rounded)
+        return layers.run([first, *rest], [known[n] for n in names], rounded=program.rounded)
 
-    def _met(self, uv: Numbers, view: Numbers, level: Any, bent: Any, active: Any) -> Met:
-        program, found = self._program, self._program.depth
-        whole, none = mi.Float(1), mi.Float(0)
-        if found is None:
-            return Met(none, whole, none)
-        if isinstance(found, Heights):
-            if self._holes is not None:
-                return on_curved(
-                    found, self._surface, self._holes, uv, view, bent, program.aspect, active
-                )
-            flat = on_plane(found, self._surface, uv, view, program.aspect, active)
-            if not found.curved:
-                return Met(flat, whole, none)
-            bends = active & (bent != 0)
-            met = on_curved(found, self._surface, None, uv, view, bent, program.aspect, bends)
-            return Met(
-                *(dr.select(bends, a, b) for a, b in zip(met, (flat, whole, none), strict=True))
+    def _met(
+        self, uv: Numbers, view: Numbers, level: Any, bent: Any, active: Any
+    ) -> tuple[Met, Numbers]:
+        """Where view rays end, and how far a network moves lookups."""
+        program = self._program
+        if isinstance(program.depth, Heights):
+            return self._marched(program.depth, uv, view, bent, active), [mi.Float(0), mi.Float(0)]
+        depth, opacity, none = mi.Float(0), mi.Float(1), mi.Float(0)
+        offset = [none, none]
+        for part, texture in zip(program.networks, self._own, strict=True):
+            psi = texture(uv[0], uv[1], 0 * uv[0], active)
+            known = layers.known(view, view, level, bent)
+            known |= dict(zip(part.texture.features, psi, strict=True))
+            inputs = [known[name] for name in part.inputs]
+            numbers = layers.run(part.layers, inputs, rounded=program.rounded)
+            if isinstance(part, DepthNetwork):
+                depth = numbers[0] * float(part.scale)
+            elif isinstance(part, OffsetNetwork):
+                offset = numbers
+            elif part.kind == "direct":
+                opacity = layers.sigmoid(numbers[0])
+            else:
+                opacity = dr.select(view[2] >= numbers[0], mi.Float(1), 0)
+        return Met(depth, opacity, none), offset
+
+    def _marched(self, found: Heights, uv: Numbers, view: Numbers, bent: Any, active: Any) -> Met:
+        program, whole, none = self._program, mi.Float(1), mi.Float(0)
+        if self._holes is not None:
+            return on_curved(
+                found, self._surface, self._holes, uv, view, bent, program.aspect, active
             )
-        assert not isinstance(found, OffsetNetwork)  # refused when this was made
-        psi = self._offset(uv[0], uv[1], 0 * uv[0], active)
-        columns = _known(view, view, level, none)
-        columns |= dict(zip(found.texture.features, psi, strict=True))
-        inputs = [columns[name] for name in found.inputs]
-        depth = _run(found.layers, inputs, rounded=program.rounded)[0] * float(found.scale)
-        return Met(depth, whole, none)
+        flat = on_plane(found, self._surface, uv, view, program.aspect, active)
+        if not found.curved:
+            return Met(flat, whole, none)
+        bends = active & (bent != 0)
+        met = on_curved(found, self._surface, None, uv, view, bent, program.aspect, bends)
+        return Met(*(dr.select(bends, a, b) for a, b in zip(met, (flat, whole, none), strict=True)))
 
     def _looked_up(
         self, texture: Texture, seen: Seen, light: Numbers | None, active: Any
     ) -> Numbers:
         place = list(seen.uv)
-        if self._program.depth is not None:
+        if isinstance(self._program.depth, OffsetNetwork):
+            if texture.view:
+                place = [x + float(texture.view) * move
+                         for x, move in zip(place, seen.offset, strict=True)]  # fmt: skip
+        elif self._program.depth is not None:
             for way, share in ((seen.view, texture.view), (light, -texture.light)):
                 if not share or way is None:
                     continue
@@ -240,14 +256,16 @@ class Evaluation:
         heads: dict[str, Numbers] = {}
         for head in self._program.heads:
             heads[head.kind], raw = raw[: head.count], raw[head.count :]
-        opacity = _sigmoid(heads["opacity"][0]) if "opacity" in heads else mi.Float(1)
+        opacity = layers.sigmoid(heads["opacity"][0]) if "opacity" in heads else mi.Float(1)
         if self._program.output == "cosine":
             return [value * light[2] for value in heads["linear"]], opacity
-        masks = [0.1 + _sigmoid(mask) for mask in heads.get("mask", [])]
+        if self._program.output == "linear":
+            return [dr.maximum(value, 0) for value in heads["linear"]], opacity
+        masks = [0.1 + layers.sigmoid(mask) for mask in heads.get("mask", [])]
         if self._program.output == "released":
             logs = [dr.minimum(y, MOST_LOG) for y in heads["log"]]
             sums = [sum(float(m) * y for m, y in zip(row, logs, strict=True)) for row in YUV_TO_RGB]
-            values = [_expm1(dr.minimum(y, MOST_LOG)) for y in sums]
+            values = [layers.expm1(dr.minimum(y, MOST_LOG)) for y in sums]
             return [dr.maximum(v * m, 0) for v, m in zip(values, masks, strict=True)], opacity
         logs = heads["log"]
         if white is not None:
@@ -255,70 +273,4 @@ class Evaluation:
             logs = [white[k] + white[c + k] * y for k, y in enumerate(logs)]
         if masks:
             logs = [y * mask for y, mask in zip(logs, masks, strict=True)]
-        return [_expm1(dr.clip(y, 0, MOST_LOG)) for y in logs], opacity
-
-
-def _known(light: Numbers, view: Numbers, level: Any, curvature: Any) -> dict[str, Any]:
-    total = [a + b for a, b in zip(light, view, strict=True)]
-    length = dr.sqrt(sum(x * x for x in total))
-    none = length < 1e-6
-    half = [dr.select(none, pole, x / dr.maximum(length, 1e-6))
-            for x, pole in zip(total, (0, 0, 1), strict=True)]  # fmt: skip
-    found = dict(zip(("lx", "ly", "lz", "vx", "vy", "vz"), (*light, *view), strict=True))
-    found |= dict(zip(("hx", "hy", "hz"), half, strict=True))
-    found |= {"cos_diff": dr.select(none, 0, length / 2), "level": level / LEVELS_UNIT}
-    found["curvature"] = curvature / (CURVATURE_UNIT + dr.abs(curvature))
-    for name, way in (("l", light), ("v", view)):
-        sine = dr.sqrt(way[0] * way[0] + way[1] * way[1])
-        stretch = dr.select(sine > 1e-6, dr.atan2(sine, way[2]) / dr.maximum(sine, 1e-6), 1)
-        for axis, x in zip("xy", way, strict=False):
-            found[f"{name}{axis}_disc"] = x * stretch * (2 / np.pi)
-    return found
-
-
-def _run(layers: Sequence[Dense], x: Numbers, *, rounded: bool) -> Numbers:
-    for k, layer in enumerate(layers):
-        weights = layer.weight.tolist()
-        sums = [mi.Float(bias) for bias in layer.bias.tolist()]
-        # A few sums at a time: as many chains as the units take, and they stay in registers.
-        for first in range(0, len(sums), _TOGETHER):
-            rows = range(first, min(first + _TOGETHER, len(sums)))
-            for column, value in enumerate(x):
-                for row in rows:
-                    sums[row] = dr.fma(weights[row][column], value, sums[row])
-        if layer.gain is not None and layer.centre is not None:
-            sums = _normalised(sums, layer.gain.tolist(), layer.centre.tolist())
-        y = [_activated(layer, layer.omega * z if layer.omega != 1 else z) for z in sums]
-        if rounded and k + 1 < len(layers):
-            y = [_bfloat16(value) for value in y]
-        x = [a + b for a, b in zip(x, y, strict=True)] if layer.residual else y
-    return x
-
-
-def _normalised(sums: Numbers, gain: list[float], centre: list[float]) -> Numbers:
-    mean = sum(sums) / len(sums)
-    apart = [z - mean for z in sums]
-    scale = 1 / dr.sqrt(sum(z * z for z in apart) / len(sums) + EPSILON)
-    return [z * scale * g + c for z, g, c in zip(apart, gain, centre, strict=True)]
-
-
-def _activated(layer: Dense, z: Any) -> Any:
-    if layer.activation == "relu":
-        return dr.maximum(z, 0)
-    if layer.activation == "leaky":
-        return dr.maximum(z, LEAK * z)
-    return dr.sin(z) if layer.activation == "sine" else z
-
-
-def _bfloat16(x: Any) -> Any:
-    bits = dr.reinterpret_array(mi.UInt32, x)
-    near = (bits + 0x7FFF + ((bits >> 16) & 1)) & 0xFFFF0000
-    return dr.reinterpret_array(mi.Float, near)
-
-
-def _sigmoid(x: Any) -> Any:
-    return 1 / (1 + dr.exp(-x))
-
-
-def _expm1(x: Any) -> Any:
-    return dr.exp(x) - 1
+        return [layers.expm1(dr.clip(y, 0, MOST_LOG)) for y in logs], opacity

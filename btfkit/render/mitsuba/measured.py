@@ -47,7 +47,7 @@ class Measured:
             texels than fit in memory.
     """
 
-    curved = passes = False
+    bends = passes = False
     # No textures of it can be differentiated.
     pyramids: Mapping[str, Any] = {}
 

@@ -96,7 +96,7 @@ class Traced:
         else:
             uv = [dr.clip(u, 0, 1), dr.clip(v, 0, 1)]
         view = [si.wi.x, si.wi.y, si.wi.z]
-        bent = self._asked.curvature(si, active) if self._evaluation.curved else 0.0
+        bent = self._asked.curvature(si, active) if self._evaluation.bends else 0.0
         return self._evaluation.seen(uv, view, self._asked.footprint(si), active, bent)
 
     def _lobe(self, si: Any, seen: Any, active: Any) -> lobes_.Drawn:
