@@ -14,7 +14,7 @@ others are stopped for certain, and would only flatter. Instead, by option:
                 of the depth raised to 0.6: outlines of what is solid, of heights found from plane
                 queries, from curved ones, from these and their opacity, from opacity alone, of
                 known ones, and of known ones as the entry's curvature alone would have them; with
-                `--looks`
+                `--looks`, `--brief`
 
 Truth on cylinders is the tracer; that of the torus is the relief on the torus itself, looked at
 every quarter of a texel along each ray. Everything is synthetic.
@@ -54,7 +54,7 @@ from btfkit.render.preview import Scene, camera_of, render
 from btfkit.shapes.torus import Torus
 
 MATERIALS = ("cobbles", "gravel", "brick", "woven", "grass", "knit")
-A_TEXEL, ROWS, PICTURE = 100, 40000, 256
+A_TEXEL, ROWS, PICTURE = 100, 40000, 192
 BENDS = (0.02, 0.85)  # curvature times depth
 VIEW, LIGHT = (v / np.linalg.norm(v) for v in np.array([[0.5, -0.35, 0.79], [0.3, 0.5, 0.8]]))
 # The torus: tiles keep their proportions on its central circle, one goes around the tube.
@@ -89,6 +89,7 @@ class Asked:
     outlines: bool
     paper: bool
     looks: int
+    brief: bool = False
 
 
 def measured(name: str, asked: Asked) -> dict[str, Any]:
@@ -138,13 +139,15 @@ def with_paper(relief: Relief, asked: Asked) -> dict[str, Material]:
 
 def on_torus(name: str, asked: Asked) -> dict[str, Any]:
     """IoU of a material's outlines on the fixed torus."""
-    relief = torus_relief(name)
+    relief, size = torus_relief(name, asked.size), asked.size
     truth = torus_outline(relief)
     start = time.process_time()
-    curved = queries_of(relief, seed=1).subset(slice(A_TEXEL * TORUS_SIZE**2))
+    curved = queries_of(relief, seed=1, a_texel=A_TEXEL)
     traced = time.process_time() - start
-    plane = random_queries(relief, A_TEXEL * TORUS_SIZE**2, seed=1, samples=4)
-    sources = {"plane": (plane, True), "curved": (curved, False), "found": (curved, True)}
+    sources = {"found": (curved, True)}
+    if not asked.brief:
+        plane = random_queries(relief, A_TEXEL * size**2, seed=1, samples=4)
+        sources |= {"plane": (plane, True), "curved": (curved, False)}
     models = {
         label: fitted(data, "sbtf", asked, levels=1, looks=asked.looks, outlines=outlines)
         for label, (data, outlines) in sources.items()
@@ -173,10 +176,10 @@ def on_torus(name: str, asked: Asked) -> dict[str, Any]:
     return {"material": name, "looks": asked.looks, **figures, "trace_s": traced, "fit_s": spent}
 
 
-def torus_relief(name: str) -> Relief:
+def torus_relief(name: str, size: int) -> Relief:
     """A material of the catalogue as it lies on the fixed torus."""
     depth = TORUS_BEND * TUBE / torus_shape().tile
-    relief = procedural.make(name, TORUS_SIZE, relief_texels=depth * TORUS_SIZE).under_surface()[0]
+    relief = procedural.make(name, size, relief_texels=depth * size).under_surface()[0]
     share = (-relief.height / depth_of(relief)) ** TORUS_SHARE
     return replace(relief, height=(-depth * share).astype(np.float32))
 
@@ -199,7 +202,7 @@ def torus_shape() -> Torus:
 
 def on_outlines(relief: Relief, asked: Asked) -> dict[str, Material]:
     """Models whose heights are found from queries on the plane and on curved surfaces."""
-    curved = queries_of(relief, seed=1).subset(slice(A_TEXEL * asked.size**2))
+    curved = queries_of(relief, seed=1, a_texel=A_TEXEL)
     return {
         f"sbtf, outlines {'heeded' if heeded else 'unheeded'}": fitted(
             curved, "sbtf", asked, levels=1, outlines=heeded
@@ -345,7 +348,7 @@ def main() -> None:
     """One line of JSON a material."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("materials", nargs="*")
-    parser.add_argument("--size", type=int, default=96)
+    parser.add_argument("--size", type=int, help="texels a side; 96, of --torus 64")
     parser.add_argument("--texels", type=float, default=6.0)
     parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--pictures", type=Path)
@@ -353,9 +356,11 @@ def main() -> None:
     parser.add_argument("--paper", action="store_true", help="against sbtf-paper")
     parser.add_argument("--torus", action="store_true", help="outlines on the fixed torus")
     parser.add_argument("--looks", type=int, default=CURVED_LOOKS, help="of --torus")
+    parser.add_argument("--brief", action="store_true", help="of --torus: found and known alone")
     given = parser.parse_args()
-    asked = Asked(given.size, given.texels, given.steps, given.pictures, given.outlines,
-                  given.paper, given.looks)  # fmt: skip
+    size = given.size or (TORUS_SIZE if given.torus else 96)
+    asked = Asked(size, given.texels, given.steps, given.pictures, given.outlines,
+                  given.paper, given.looks, given.brief)  # fmt: skip
     names = given.materials or (TORUS_MATERIALS if given.torus else MATERIALS)
     for name in names:
         found = on_torus(name, asked) if given.torus else measured(name, asked)

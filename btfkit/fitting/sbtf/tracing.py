@@ -16,14 +16,18 @@ _LOWEST_Z = 0.03
 _SAMPLES = 4
 
 
-def queries_of(relief: Relief, *, seed: int) -> QuerySet:
-    """Traced answers of a relief under its surface: views from above, lights all round."""
+def queries_of(relief: Relief, *, seed: int, a_texel: int = 0) -> QuerySet:
+    """Traced answers of a relief under its surface: views from above, lights all round.
+
+    Args:
+        a_texel: how many; 0 takes what `sbtf` is fitted to.
+    """
     h, w = relief.size
     depth = float(relief.height.max() - relief.height.min())
     sharpest = min(_BENDS[1] / max(depth, 1e-9), _SHARPEST)
     return random_queries(
         relief,
-        min(_A_TEXEL * h * w, _MOST),
+        min((a_texel or _A_TEXEL) * h * w, _MOST),
         seed=seed,
         curvatures=(sharpest * _BENDS[0] / _BENDS[1], sharpest),
         lowest_z=_LOWEST_Z,
