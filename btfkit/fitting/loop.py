@@ -393,9 +393,7 @@ def _tensor(array: NDArray[Any]) -> Tensor:
     return torch.from_numpy(array)
 
 
-def tensors_of(
-    modules: Mapping[str, torch.nn.Module], optimisers: Mapping[str, torch.optim.Optimizer]
-) -> State:
+def tensors_of(modules: Mapping[str, torch.nn.Module], optimisers: Mapping[str, Any]) -> State:
     """Copies of all weights and moments, by flat names: the heart of most `state`s."""
     import torch
 
@@ -415,7 +413,7 @@ def tensors_of(
 def restore_tensors(
     state: Mapping[str, Tensor],
     modules: Mapping[str, torch.nn.Module],
-    optimisers: Mapping[str, torch.optim.Optimizer],
+    optimisers: Mapping[str, Any],
 ) -> None:
     """Give back to modules and optimisers what `tensors_of` took from them."""
     for name, module in modules.items():

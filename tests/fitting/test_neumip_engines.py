@@ -13,7 +13,7 @@ from btfkit.errors import FitError
 from btfkit.fitting import fit as fitting
 from btfkit.fitting import loop, training
 from btfkit.fitting.fit import fit
-from btfkit.fitting.neumip import data
+from btfkit.fitting.neumip import data, rows
 from btfkit.fitting.neumip import paper as neumip_paper
 from btfkit.fitting.neumip import trainable as neumip
 from btfkit.fitting.neumip.engines import device as neumip_device
@@ -191,7 +191,7 @@ def test_on_a_device_rows_of_queries_are_the_same():
     uv, light, view = rng.random((300, 2), np.float32), upper(rng, 300), upper(rng, 300)
     rgb, weight = rng.random((300, 3), np.float32), rng.random(300, np.float32)
     found = QuerySet(uv, light, view, footprint=weight + 0.5, rgb=rgb, weight=weight, size=(16, 16))
-    source = data.RowSource(found, np.arange(250), np.arange(250, 300), seed=1)
+    source = rows.RowSource(found, np.arange(250), np.arange(250, 300), seed=1)
     same_batches(source, ((0, 100), (3, 100), (4, 1000)))
 
 
