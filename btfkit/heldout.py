@@ -45,7 +45,7 @@ def split(count: int, holdout: float = 0.05, seed: int = 0) -> tuple[Index, Inde
 
 
 # A fit asks for one and the same split of its millions of rows from several places.
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)
 def _split(count: int, held: int, seed: int) -> tuple[Index, Index]:
     tested = np.zeros(count, bool)
     tested[np.random.default_rng([seed, 0x5EED]).permutation(count)[:held]] = True

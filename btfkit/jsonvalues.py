@@ -15,6 +15,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
+        if set(map(type, value)) == {int}:
+            return list(value)
         return [plain(item) for item in value]
     if isinstance(value, os.PathLike):
         return os.fspath(value)

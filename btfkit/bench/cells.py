@@ -10,7 +10,6 @@ from typing import Any, final
 
 import numpy as np
 
-from btfkit import native
 from btfkit.bench import machine, measures
 from btfkit.bench.cases import Case
 from btfkit.fitting import CLOSED_FORM, TRAINED
@@ -204,11 +203,8 @@ def _closed_form(cell: Cell, case: Case) -> tuple[Material, _Ran, Mapping[str, A
 
 def _trainable(cell: Cell, cases: Sequence[Case]) -> tuple[Any, Any]:
     """What is trained, and the generators that it draws from."""
-    import torch
-
     from btfkit.fitting.loop import Generators
 
-    torch.set_num_threads(native.threads())
     first, *others = (case.train for case in cases)
     generators = Generators(cell.seed)
     more: dict[str, Any] = {"others": others} if others else {}

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, final
 
-import torch
+import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from btfkit.fitting.gains import Found
-from btfkit.fitting.loop import Trainable
+from btfkit.fitting.loop import State, Trainable
 from btfkit.materials.base import Material
 from btfkit.relief.relief import Relief
 
@@ -42,20 +41,20 @@ class Gained(Trainable):
     def score(self) -> float:
         return self.inner.score()
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> State:
         found = {f"inner.{name}": value for name, value in self.inner.state().items()}
-        found["gains"] = torch.from_numpy(self.found.values.copy())
-        found["gains.done"] = torch.tensor([self._done])
+        found["gains"] = self.found.values.copy()
+        found["gains.done"] = np.array([self._done])
         return found
 
-    def restore(self, state: Mapping[str, Tensor]) -> None:
+    def restore(self, state: Mapping[str, Any]) -> None:
         prefix = "inner."
         self.inner.restore(
             {n.removeprefix(prefix): v for n, v in state.items() if n.startswith(prefix)}
         )
         self.queries = self.inner.queries
-        self.found.values = state["gains"].numpy()
-        self._done = int(state["gains.done"])
+        self.found.values = state["gains"]
+        self._done = int(state["gains.done"][0])
 
     def training_arrays(self) -> dict[str, NDArray[Any]]:
         return self.inner.training_arrays() | self.found.arrays()

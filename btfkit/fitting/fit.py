@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from btfkit.btf import BTF
-from btfkit.coverage import Coverage
+from btfkit.coverage import SAMPLE, Coverage
 from btfkit.errors import FitError, unknown
 from btfkit.files import refuse_existing
 from btfkit.fitting import CLOSED_FORM, MODELS, TAUGHT, TRACED, gains, loaded
@@ -258,8 +258,11 @@ def _covered(data: BTF | QuerySet, plan: Plan) -> Coverage | None:
     rows = split(len(data), plan.holdout, plan.seed)[0]
     if isinstance(data, QuerySet):
         rows = rows[data.valid()[rows]]
-    seen = rows[data.view[rows, 2] > 0]
-    return Coverage.of(data.light[seen], data.view[seen]) if len(seen) else None
+    seen = rows[data.view[:, 2][rows] > 0]
+    count = len(seen)
+    if count > SAMPLE:
+        seen = seen[np.random.default_rng(0).choice(count, SAMPLE, replace=False)]
+    return Coverage.of(data.light[seen], data.view[seen], count=count) if count else None
 
 
 def _provenance(

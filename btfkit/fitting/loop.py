@@ -10,15 +10,14 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
-from torch import Tensor
+from safetensors.numpy import save_file
 
 from btfkit.errors import FitError, FormatError
 from btfkit.files import whole
@@ -26,8 +25,14 @@ from btfkit.materials.base import Material
 from btfkit.relief.relief import Relief
 
 if TYPE_CHECKING:
+    # It takes two seconds to load, and what is trained by compiled kernels does without it.
+    import torch
+    from torch import Tensor
+
     from btfkit.fitting.processes import Processes
 
+# What a trainable's steps depend on, by name: arrays, or torch's tensors on the CPU.
+State = dict[str, Any]
 # Held-out looks at the model: enough for a curve, and a small share of the time. Where time is
 # what is shared, they become rarer, so that they take no more than this of it.
 _LOOKS, _LOOKING = 12, 0.1
@@ -67,11 +72,11 @@ class Trainable(ABC):
         """Error on a fixed, small part of the held-out set; lower is better; NaN without one."""
 
     @abstractmethod
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> State:
         """Everything that later steps depend on, copied: weights, moments, counters."""
 
     @abstractmethod
-    def restore(self, state: Mapping[str, Tensor]) -> None:
+    def restore(self, state: Mapping[str, Any]) -> None:
         """Take back what `state` gave."""
 
     def training_arrays(self) -> dict[str, NDArray[Any]]:
@@ -119,12 +124,12 @@ class Trainable(ABC):
         """Halve the learning rates, after a divergence."""
         self._rate *= 0.5
 
-    def _counters(self, *more: int) -> Tensor:
+    def _counters(self, *more: int) -> NDArray[np.float64]:
         """Steps, rate, queries and a model's own counters, as a state holds them."""
         numbers = [self._steps, self._rate, self.queries, *more]
-        return torch.tensor(numbers, dtype=torch.float64)
+        return np.array(numbers, np.float64)
 
-    def _count_from(self, counters: Tensor) -> list[int]:
+    def _count_from(self, counters: Any) -> list[int]:
         """Take back what `_counters` gave; returns the model's own."""
         steps, self._rate, queries, *more = counters.tolist()
         self._steps, self.queries = int(steps), int(queries)
@@ -172,7 +177,7 @@ def train(
     generators: Generators,
     state_file: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
-    best: Mapping[str, Tensor] | None = None,
+    best: Mapping[str, Any] | None = None,
     look: Callable[[Run], None] | None = None,
 ) -> None:
     """Train until the budget is spent; the trainable ends in its best state.
@@ -215,12 +220,21 @@ class Generators:
     """All randomness of a run: one torch and one numpy generator from one seed."""
 
     seed: int
-    torch: torch.Generator = field(init=False)
     numpy: np.random.Generator = field(init=False)
 
     def __post_init__(self) -> None:
-        self.torch = torch.Generator().manual_seed(self.seed)
         self.numpy = np.random.default_rng(self.seed)
+
+    @cached_property
+    def torch(self) -> torch.Generator:
+        """Made when it is asked for."""
+        import torch
+
+        return torch.Generator().manual_seed(self.seed)
+
+    def asked(self) -> bool:
+        """Whether torch's generator was made."""
+        return "torch" in self.__dict__
 
 
 class _Keeper:
@@ -232,7 +246,7 @@ class _Keeper:
         run: Run,
         generators: Generators,
         state_file: Path | None,
-        best: Mapping[str, Tensor] | None,
+        best: Mapping[str, Any] | None,
     ) -> None:
         self._trainable, self._run, self._generators = trainable, run, generators
         self._file = state_file
@@ -306,7 +320,7 @@ def save_state(
     trainable: Trainable,
     run: Run,
     generators: Generators,
-    best: Mapping[str, Tensor] | None,
+    best: Mapping[str, Any] | None,
 ) -> None:
     """Write what a later run needs to go on with the very same trajectory."""
     record = {
@@ -317,13 +331,11 @@ def save_state(
     }
     tensors = {f"now.{name}": value for name, value in trainable.state().items()}
     tensors |= {f"best.{name}": value for name, value in (best or {}).items()}
-    tensors["torch_generator"] = generators.torch.get_state()
+    if generators.asked():
+        tensors["torch_generator"] = generators.torch.get_state()
+    arrays = {name: np.array(value, order="C") for name, value in tensors.items()}
     with whole(path, force=True) as partial:
-        save_file(
-            {name: value.contiguous().clone() for name, value in tensors.items()},
-            partial,
-            {"btfkit_state": json.dumps(record)},
-        )
+        save_file(arrays, partial, {"btfkit_state": json.dumps(record)})
 
 
 _RUN_FIELDS = (
@@ -331,18 +343,16 @@ _RUN_FIELDS = (
 )  # fmt: skip
 
 
-def load_state(
-    path: Path, trainable: Trainable, run: Run, generators: Generators
-) -> dict[str, Tensor] | None:
+def load_state(path: Path, trainable: Trainable, run: Run, generators: Generators) -> State | None:
     """Take up a run where `save_state` left it; returns the best state so far.
 
     Raises:
         FormatError: the file is damaged or of another model.
     """
     try:
-        with safe_open(path, framework="pt") as file:
+        with safe_open(path, framework="np") as file:
             record = json.loads(file.metadata()["btfkit_state"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise FormatError(
             path, f"not a readable state ({error})", remedy="start without --resume"
@@ -355,17 +365,38 @@ def load_state(
     run.budget_s, run.steps = wanted
     trainable.queries = record["queries"]
     generators.numpy.bit_generator.state = record["numpy"]
-    generators.torch.set_state(tensors.pop("torch_generator"))
-    now = {n.removeprefix("now."): t for n, t in tensors.items() if n.startswith("now.")}
-    best = {n.removeprefix("best."): t for n, t in tensors.items() if n.startswith("best.")}
+    if "torch_generator" in arrays:
+        generators.torch.set_state(_tensor(arrays.pop("torch_generator")))
+    own = trainable.state()
+    now, best = (_as_in(own, arrays, prefix) for prefix in ("now.", "best."))
     trainable.restore(now)
     return best or None
 
 
-def tensors_of(
-    modules: Mapping[str, torch.nn.Module], optimisers: Mapping[str, torch.optim.Optimizer]
-) -> dict[str, Tensor]:
+def _as_in(own: State, arrays: Mapping[str, NDArray[Any]], prefix: str) -> State:
+    """The arrays below a prefix, of the kinds that a state holds them in."""
+    if all(isinstance(value, np.ndarray) for value in own.values()):
+        torchless = set(arrays)
+    else:
+        # Moments that no step has made yet are torch's, too.
+        torchless = {prefix + name for name, value in own.items() if isinstance(value, np.ndarray)}
+    return {
+        name.removeprefix(prefix): array if name in torchless else _tensor(array)
+        for name, array in arrays.items()
+        if name.startswith(prefix)
+    }
+
+
+def _tensor(array: NDArray[Any]) -> Tensor:
+    import torch
+
+    return torch.from_numpy(array)
+
+
+def tensors_of(modules: Mapping[str, torch.nn.Module], optimisers: Mapping[str, Any]) -> State:
     """Copies of all weights and moments, by flat names: the heart of most `state`s."""
+    import torch
+
     found: dict[str, Any] = {}
     for name, module in modules.items():
         for key, value in module.state_dict().items():
@@ -382,7 +413,7 @@ def tensors_of(
 def restore_tensors(
     state: Mapping[str, Tensor],
     modules: Mapping[str, torch.nn.Module],
-    optimisers: Mapping[str, torch.optim.Optimizer],
+    optimisers: Mapping[str, Any],
 ) -> None:
     """Give back to modules and optimisers what `tensors_of` took from them."""
     for name, module in modules.items():

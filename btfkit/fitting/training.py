@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import sys
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any, cast, final
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit import native
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.files import room_for
@@ -120,9 +122,12 @@ def begun(
 
     finds = gains.wanted(settings, model, source)
     data = gains.prepared(cast(BTF, source), generators.seed) if finds else source
-    trainable: Trainable = loaded(TRAINED[model])(
+    kind = loaded(TRAINED[model])
+    _limit_threads()
+    trainable: Trainable = kind(
         data, train, test, settings=gains.without(settings), generators=generators, **more
     )
+    _limit_threads()
     return Gained(trainable, gains.Found(cast(BTF, data), train)) if finds else trainable
 
 
@@ -142,14 +147,10 @@ def trained(
         relief: what the source was traced from, if it was.
         teacher: whose answers the model learns, if it does.
     """
-    import torch
-
-    from btfkit import native
     from btfkit.fitting import loop
 
     if plan.device == "cuda" and not gpu():
         raise FitError("no CUDA device is available", remedy="use --device cpu")
-    torch.set_num_threads(native.threads())
     # Processes that fit together draw other queries, of other textures where not all have room.
     generators = loop.Generators(plan.seed + int(os.environ["RANK"] if shared() else 0))
     if isinstance(source, QuerySet):
@@ -208,11 +209,35 @@ def following(environment: Mapping[str, str] = os.environ) -> bool:
     return shared(environment) and environment["RANK"] != "0"
 
 
+def _limit_threads() -> None:
+    """Let torch use as many threads as kernels do, where it was loaded at all."""
+    if "torch" in sys.modules:
+        import torch
+
+        torch.set_num_threads(native.threads())
+
+
 def gpu() -> str:
-    """torch's name of the GPU; empty without one."""
+    """torch's name of the GPU; empty without one.
+
+    torch takes two seconds to load: where there is no driver it is not asked.
+    """
+    if "torch" not in sys.modules and not _driver():
+        return ""
     import torch
 
     return "cuda" if torch.cuda.is_available() else ""
+
+
+def _driver() -> bool:
+    """Whether a driver of CUDA, or of ROCm, which torch calls the same, may be installed."""
+    if Path("/dev/kfd").exists():
+        return True
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return False
+    return True
 
 
 def _samples(source: BTF | QuerySet) -> int:

@@ -6,11 +6,13 @@ Source: Jordan et al., "Muon: An optimizer for hidden layers in neural networks"
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from typing import Any, final
+from collections.abc import Iterable
+from typing import final
 
 import torch
 from torch import Tensor, nn
+
+from btfkit.fitting.optimisers import Optimiser
 
 # Coefficients of the quintic whose iteration lifts all singular values to about 1; from the source.
 _QUINTIC = (3.4445, -4.7750, 2.0315)
@@ -18,7 +20,7 @@ _ITERATIONS = 5
 
 
 @final
-class Muon(torch.optim.Optimizer):
+class Muon(Optimiser):
     """Nesterov momentum, orthogonalised.
 
     Args:
@@ -30,27 +32,19 @@ class Muon(torch.optim.Optimizer):
     def __init__(
         self, parameters: Iterable[nn.Parameter], *, lr: float = 0.0, momentum: float = 0.95
     ) -> None:
-        super().__init__(list(parameters), {"lr": lr, "momentum": momentum})
+        super().__init__(parameters, lr)
+        self._keep = momentum
 
-    @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
-        """Move every matrix that has a gradient."""
-        del closure
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                if parameter.grad is not None:
-                    self._move(parameter, group)
-
-    def _move(self, parameter: nn.Parameter, group: dict[str, Any]) -> None:
-        gradient, keep = parameter.grad, group["momentum"]
-        assert gradient is not None
-        slots = self.state[parameter]
-        if "momentum" not in slots:
+    def _move(
+        self, parameter: nn.Parameter, gradient: Tensor, slots: dict[str, Tensor], lr: float
+    ) -> None:
+        keep = self._keep
+        if not slots:
             slots["momentum"] = torch.zeros_like(parameter)
         momentum: Tensor = slots["momentum"].lerp_(gradient, 1 - keep)
         out, into = parameter.shape
         scale = math.sqrt(max(1.0, out / into))
-        parameter.add_(orthogonalised(gradient.lerp(momentum, keep)), alpha=-group["lr"] * scale)
+        parameter.add_(orthogonalised(gradient.lerp(momentum, keep)), alpha=-lr * scale)
 
 
 def orthogonalised(matrix: Tensor) -> Tensor:

@@ -41,6 +41,7 @@ from btfkit.fitting.neubtf.muon import Muon
 from btfkit.fitting.neubtf.settings import Settings
 from btfkit.fitting.neumip.data import TexelSource
 from btfkit.fitting.neumip.trainable import NeuMIP
+from btfkit.fitting.optimisers import Adam, Optimiser
 from btfkit.fitting.schedule import pace
 from btfkit.materials.neubtf.material import NeuBTF as Evaluated
 from btfkit.materials.neumip.material import NeuMIPMaterial
@@ -121,9 +122,9 @@ class NeuBTF(Trainable):
         self._taught, self._level = 0, 0.0
         self._wanted: Tensor | None = None
         self.encoder = Encoder(INPUTS, 1 + free, self._generators.torch)
-        self._optimisers: dict[str, torch.optim.Optimizer] = {
+        self._optimisers: dict[str, Optimiser] = {
             "muon": Muon(self.encoder.matrices()),
-            "adam": torch.optim.Adam(self.encoder.rest(), lr=0.0, betas=(0.9, 0.99)),
+            "adam": Adam(self.encoder.rest(), lr=0.0, betas=(0.9, 0.99)),
         }
 
     # --- the loop's side -------------------------------------------------------------------

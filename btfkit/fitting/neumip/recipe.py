@@ -9,11 +9,10 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from btfkit.btf import BTF, Wrap
 from btfkit.errors import FitError
-from btfkit.fitting.loop import Generators, Trainable
+from btfkit.fitting.loop import Generators, State, Trainable
 from btfkit.fitting.neumip.data import Batch, Source, TexelSource
 from btfkit.fitting.neumip.rows import source_of
 from btfkit.fitting.neumip.settings import Shared, refuse_unused
@@ -122,11 +121,11 @@ class Recipe(Trainable, ABC, Generic[S]):
         """Weights and texels as the model would be saved now."""
 
     @abstractmethod
-    def _tensors(self) -> dict[str, Tensor]:
+    def _tensors(self) -> State:
         """Copies of all that the steps change, but the counters."""
 
     @abstractmethod
-    def _put(self, state: Mapping[str, Tensor]) -> None:
+    def _put(self, state: Mapping[str, Any]) -> None:
         """Take back what `_tensors` gave."""
 
     def _answers(self, material: evaluated.NeuMIPMaterial, held: Batch) -> Array:
@@ -148,10 +147,10 @@ class Recipe(Trainable, ABC, Generic[S]):
             error = np.log1p(np.maximum(held.target, -0.1)) - np.log1p(answer)
         return float(np.square(error[good]).mean())
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> State:
         return self._tensors() | {"numbers": self._counters()}
 
-    def restore(self, state: Mapping[str, Tensor]) -> None:
+    def restore(self, state: Mapping[str, Any]) -> None:
         self._put(state)
         self._count_from(state["numbers"])
 

@@ -7,7 +7,6 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.neumip.data import (
@@ -110,10 +109,10 @@ class _Ordered:
     def _put(self, rows: NDArray[np.intp], at: slice) -> None:
         queries, to = self._queries, self._all
         assert queries.rgb is not None
-        to.uv[at] = queries.uv[rows]
-        to.light[at] = directions.normalize(queries.light[rows])
-        to.view[at] = directions.normalize(queries.view[rows])
-        target = queries.rgb[rows]
+        to.uv[at] = _taken(queries.uv, rows)
+        to.light[at] = _unit(_taken(queries.light, rows))
+        to.view[at] = _unit(_taken(queries.view, rows))
+        target = _taken(queries.rgb, rows)
         if self._opacity is not None:
             target = np.where(self._opacity[rows, None] < 0.5, np.float32(np.nan), target)
         to.target[at] = target
@@ -121,6 +120,20 @@ class _Ordered:
                                (to.curvature, queries.curvature)):  # fmt: skip
             if column is not None and source is not None:
                 column[at] = source[rows]
+
+
+def _taken(table: Array, rows: NDArray[np.intp]) -> Array:
+    """table[rows] of a contiguous (n, k): numpy moves whole rows four times as fast as numbers."""
+    n, k = table.shape
+    found: Array = table.view(f"V{4 * k}").reshape(n).take(rows).view(np.float32).reshape(-1, k)
+    return found
+
+
+def _unit(rows: Array) -> NDArray[np.float64]:
+    """Valid rows (n, 3) at length one; float64, in which no square of a float32 overflows."""
+    wide = rows.astype(np.float64)
+    found: NDArray[np.float64] = wide / np.sqrt(np.einsum("ij,ij->i", wide, wide))[:, None]
+    return found
 
 
 def _cut(rows: Batch, at: slice) -> Batch:

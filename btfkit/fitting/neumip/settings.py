@@ -150,6 +150,7 @@ class Settings(Stepped):
             and network as published.
         offset_width, offset_activation: of the offset network's hidden layers.
         finer: levels by which textures are finer than the level that they answer for alone.
+        layers: hidden ones of the decoder.
         matrix: what a GPU's kernels round the factors of products to: "fp32", "tf32", "bf16" or
             "fp16"; sums are float32.
     """
@@ -160,6 +161,7 @@ class Settings(Stepped):
     offset_width: int = 25
     offset_activation: str = "relu"
     finer: float = 0.5
+    layers: int = 3
     matrix: str = "bf16"
 
     def __post_init__(self) -> None:
@@ -168,7 +170,8 @@ class Settings(Stepped):
         _one_of(self, "depth", ("heights", "network"))
         _one_of(self, "matrix", ("fp32", "tf32", "bf16", "fp16"))
         for name, low, high in (
-            ("offset", 0, 8), ("light", 0, 8), ("offset_width", 1, 128), ("finer", 0, 1)
+            ("offset", 0, 8), ("light", 0, 8), ("offset_width", 1, 128), ("finer", 0, 1),
+            ("layers", 1, 7),
         ):  # fmt: skip
             _within(self, name, low, high)
 

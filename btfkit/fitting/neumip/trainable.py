@@ -8,28 +8,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, TypeVar, final
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, final
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from btfkit.btf import BTF
-from btfkit.fitting.loop import Trainable
+from btfkit.fitting.loop import State, Trainable
 from btfkit.fitting.neumip.data import Batch
 from btfkit.fitting.neumip.engines.base import MOMENTS, PARAMETERS, Engine, Step
-from btfkit.fitting.neumip.engines.compiled import Compiled, Plain
+from btfkit.fitting.neumip.engines.compiled import Compiled
 from btfkit.fitting.neumip.recipe import Recipe
 from btfkit.fitting.neumip.settings import INPUTS, Settings, Stepped
 from btfkit.fitting.neumip.start import begin_from, initial_texels, initial_weights
 from btfkit.fitting.prior.pairs import Guesses, guesses
-from btfkit.fitting.processes import Processes
 from btfkit.fitting.schedule import pace
 from btfkit.materials.neumip import material as evaluated
 from btfkit.materials.neumip.arrays import aligned
 from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.native.neural import Loss, available
 from btfkit.native.neural.layout import Array
+
+if TYPE_CHECKING:
+    from btfkit.fitting.processes import Processes
 
 _SMOOTH_STEPS = 16
 _SMOOTH_HALVES = 5
@@ -63,9 +64,11 @@ class Marching(Recipe[S]):
             for moment in MOMENTS:
                 room = aligned(layout.texels) if name == "texels" else np.zeros_like(flat)
                 arrays[f"{name}.{moment}"] = room
-        kind = Compiled if available() else Plain
         loss: Loss = self.settings.loss  # type: ignore[assignment]
-        self.engine: Engine[Any] = kind(layout, arrays, self._source, loss)
+        kind: type[Engine[Any]] = Compiled
+        if not available():
+            from btfkit.fitting.neumip.engines.plain import Plain as kind
+        self.engine: Engine[Any] = kind(layout, arrays, self._source, loss)  # type: ignore[call-arg]
 
     def join(self, processes: Processes) -> None:
         from btfkit.fitting.neumip.engines.together import Together, follow
@@ -76,20 +79,18 @@ class Marching(Recipe[S]):
             self.engine = Together(self.engine, processes)
 
     def part(self) -> bool:
-        from btfkit.fitting.neumip.engines.together import Together
-
-        together = isinstance(self.engine, Together)
-        if isinstance(self.engine, Together):
-            self.engine = self.engine.ended()
-        return together
+        alone = self.engine.ended()
+        if alone is not None:
+            self.engine = alone
+        return alone is not None
 
     def _current(self) -> tuple[Array, Array]:
         return self.engine.parameters()
 
-    def _tensors(self) -> dict[str, Tensor]:
+    def _tensors(self) -> State:
         return self.engine.state()
 
-    def _put(self, state: Mapping[str, Tensor]) -> None:
+    def _put(self, state: Mapping[str, Any]) -> None:
         self.engine.restore(state)
 
     def _answers(self, material: evaluated.NeuMIPMaterial, held: Batch) -> Array:
@@ -163,7 +164,7 @@ def spec_of(s: Settings, size: tuple[int, int], levels: int, channels: int = 3) 
         offset=s.offset,
         frames=min(s.frames, s.features // 3),
         heights=bool(s.offset) and s.depth == "heights",
-        hidden=(s.width,) * 3,
+        hidden=(s.width,) * s.layers,
         offset_hidden=(s.offset_width,) * 3,
         activation=s.activation,  # type: ignore[arg-type]
         offset_activation=s.offset_activation,  # type: ignore[arg-type]

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from btfkit.btf import BTF
 from btfkit.errors import FitError
-from btfkit.fitting.loop import Generators, Trainable
+from btfkit.fitting.loop import Generators, State, Trainable
 from btfkit.fitting.neumip.blurring import blur_at, blurred
 from btfkit.fitting.neumip.data import Batch
 from btfkit.fitting.neumip.forward import bilinear, directions
@@ -227,13 +227,13 @@ class SBTFPaper(Trainable):
             truth = self._data.opacity[held.rows]
         return colour + float(np.square(opacity - truth).mean())
 
-    def state(self) -> dict[str, Tensor]:
-        found = {name: torch.from_numpy(array.copy()) for name, array in self._arrays.items()}
+    def state(self) -> State:
+        found = {name: array.copy() for name, array in self._arrays.items()}
         return found | {"numbers": self._counters()}
 
-    def restore(self, state: Mapping[str, Tensor]) -> None:
+    def restore(self, state: Mapping[str, Any]) -> None:
         for name, array in self._arrays.items():
-            array[...] = state[name].numpy()
+            array[...] = state[name]
         self._count_from(state["numbers"])
 
 

@@ -5,19 +5,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence, Sized
 from dataclasses import dataclass
-from typing import Generic, TypeVar, final
-
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, final
 
 from btfkit.fitting.neumip.data import Batch
 from btfkit.materials.neumip.material import NeuMIPMaterial
 from btfkit.native.neural.layout import Array
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 # Names of what is trained, and of the moments that Adam keeps of each.
 PARAMETERS = ("weights", "texels")
 MOMENTS = ("first", "second")
-# uv, light, view and footprint of queries.
-Tensors = tuple[Tensor, Tensor, Tensor, Tensor | None]
 B = TypeVar("B", bound=Sized)
 
 
@@ -39,29 +38,6 @@ class Step:
     dense: bool
     kept: float
     blur: float
-
-
-class Gradients(ABC):
-    """What answers, and takes gradients, of one layout whose parameters torch holds."""
-
-    @abstractmethod
-    def evaluate(
-        self, weights: Tensor, texels: Tensor, batch: Tensors, *, raw: bool = False
-    ) -> Tensor:
-        """Reflectance (b, c) of a batch, or the decoder's raw numbers; no gradients."""
-
-    @abstractmethod
-    def gradients(
-        self,
-        weights: Tensor,
-        texels: Tensor,
-        batch: Tensors,
-        target: Tensor,
-        weight: Tensor | None = None,
-        *,
-        loss: str = "square",
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Loss of a batch as `forward.loss_of`, its gradients by weights and by texels."""
 
 
 class Engine(ABC, Generic[B]):
@@ -98,12 +74,16 @@ class Engine(ABC, Generic[B]):
         """Weights and texels as they stand, in the CPU's memory."""
 
     @abstractmethod
-    def state(self) -> dict[str, Tensor]:
-        """Copies of parameters and moments, on the CPU."""
+    def state(self) -> dict[str, Array]:
+        """Copies of parameters and moments, in the CPU's memory."""
 
     @abstractmethod
-    def restore(self, state: Mapping[str, Tensor]) -> None:
+    def restore(self, state: Mapping[str, Array]) -> None:
         """Take back what `state` gave."""
+
+    def ended(self) -> Engine[Any] | None:
+        """What goes on alone, of an engine whose steps several processes took; else None."""
+        return None
 
     def answers(self, material: NeuMIPMaterial, held: Batch) -> Array:
         """Reflectance (b, c) of a material for the held-out queries."""

@@ -1,22 +1,21 @@
-"""Engines on the CPU: the compiled kernels, and where none was built, autograd and numpy."""
+"""The engine of the compiled kernels, and what every engine on the CPU keeps its arrays in."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from btfkit.fitting.neumip.data import Batch, Source
 from btfkit.fitting.neumip.engines.base import MOMENTS, PARAMETERS, Engine, Step
-from btfkit.fitting.neumip.forward import loss_on_batch
 from btfkit.native.neural import Kernel, Loss
-from btfkit.native.neural.adam import adam_plain
 from btfkit.native.neural.blur import blur
 from btfkit.native.neural.layout import Array, Layout
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @final
@@ -49,14 +48,14 @@ class Arrays:
             good &= np.isfinite(self._layout.surface(texels)).all()
         return bool(good)
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> dict[str, Array]:
         """Copies of all arrays."""
-        return {name: torch.from_numpy(array.copy()) for name, array in self._arrays.items()}
+        return {name: array.copy() for name, array in self._arrays.items()}
 
-    def restore(self, state: Mapping[str, Tensor]) -> None:
+    def restore(self, state: Mapping[str, Array]) -> None:
         """Take back what `state` gave."""
         for name, array in self._arrays.items():
-            array[...] = state[name].numpy()
+            array[...] = state[name]
 
 
 @final
@@ -77,6 +76,8 @@ class Compiled(Engine[Batch]):
         return self._moved(self._gradients(batch), step)
 
     def pull(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+        import torch
+
         loss = torch.tensor(self._gradients(batch), dtype=torch.float64)
         weights, texels = map(torch.from_numpy, self._kernel.gradients())
         return loss, weights, texels
@@ -108,43 +109,8 @@ class Compiled(Engine[Batch]):
     def parameters(self) -> tuple[Array, Array]:
         return self._arrays.parameters()
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> dict[str, Array]:
         return self._arrays.state()
 
-    def restore(self, state: Mapping[str, Tensor]) -> None:
-        self._arrays.restore(state)
-
-
-@final
-class Plain(Engine[Batch]):
-    """Where no kernel was built: autograd on the CPU, and the kernels' twins for the rest."""
-
-    def __init__(
-        self, layout: Layout, arrays: dict[str, Array], source: Source, loss: Loss
-    ) -> None:
-        self._arrays, self._source = Arrays(layout, arrays), source
-        self._layout, self._loss = layout, loss
-
-    def batch(self, number: int, count: int) -> Batch:
-        return self._source.batch(number, count)
-
-    def pull(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
-        weights, texels = (torch.from_numpy(a).requires_grad_() for a in self.parameters())
-        loss = loss_on_batch(self._layout, weights, texels, batch, self._loss)
-        by_weights, by_texels = torch.autograd.grad(loss, (weights, texels))
-        return loss.detach(), by_weights, by_texels
-
-    def push(self, loss: Tensor, gradients: Sequence[Tensor], step: Step) -> float:
-        for name, rate, gradient in zip(PARAMETERS, step.rates, gradients, strict=True):
-            slots = self._arrays.slots(name)
-            adam_plain(slots, gradient.numpy(), rate, step.number, step.betas, dense=step.dense)
-        return float(loss) if self._arrays.settle(step) else math.nan
-
-    def parameters(self) -> tuple[Array, Array]:
-        return self._arrays.parameters()
-
-    def state(self) -> dict[str, Tensor]:
-        return self._arrays.state()
-
-    def restore(self, state: Mapping[str, Tensor]) -> None:
+    def restore(self, state: Mapping[str, Array]) -> None:
         self._arrays.restore(state)

@@ -18,8 +18,9 @@ from btfkit.conventions import MOST_LOG
 from btfkit.fitting.neumip import forward
 from btfkit.fitting.neumip.data import Batch, Source
 from btfkit.fitting.neumip.engines import triton
-from btfkit.fitting.neumip.engines.base import MOMENTS, PARAMETERS, Engine, Gradients, Step, Tensors
+from btfkit.fitting.neumip.engines.base import MOMENTS, PARAMETERS, Engine, Step
 from btfkit.fitting.neumip.engines.device_draw import DeviceBatch, DeviceSource
+from btfkit.fitting.neumip.engines.gradients import Gradients, Tensors
 from btfkit.fitting.neumip.engines.triton import Fused, Matrix
 from btfkit.materials.neumip import material as evaluated
 from btfkit.native.neural import Loss
@@ -90,7 +91,7 @@ class OnDevice(Engine[DeviceBatch]):
     def __init__(
         self,
         layout: Layout,
-        state: Mapping[str, Tensor],
+        state: Mapping[str, Array],
         source: Source,
         device: str,
         *,
@@ -101,7 +102,9 @@ class OnDevice(Engine[DeviceBatch]):
         self._layout, self._loss, self._matrix = layout, loss, matrix
         self._gradients = gradients_on(layout, self._place, matrix=matrix)
         self._source = DeviceSource(source, self._place)
-        self._tensors = {name: value.to(self._place) for name, value in state.items()}
+        self._tensors = {
+            name: torch.tensor(value, device=self._place) for name, value in state.items()
+        }
         self._last: Tensor | None = None
 
     def batch(self, number: int, count: int) -> DeviceBatch:
@@ -139,13 +142,13 @@ class OnDevice(Engine[DeviceBatch]):
         weights, texels = (self._tensors[name].cpu().numpy() for name in PARAMETERS)
         return weights, texels
 
-    def state(self) -> dict[str, Tensor]:
-        return {name: tensor.to("cpu", copy=True) for name, tensor in self._tensors.items()}
+    def state(self) -> dict[str, Array]:
+        return {name: tensor.to("cpu", copy=True).numpy() for name, tensor in self._tensors.items()}
 
-    def restore(self, state: Mapping[str, Tensor]) -> None:
+    def restore(self, state: Mapping[str, Array]) -> None:
         self._last = None
         for name, tensor in self._tensors.items():
-            tensor.copy_(state[name])
+            tensor.copy_(torch.from_numpy(state[name]))
 
     def answers(self, material: evaluated.NeuMIPMaterial, held: Batch) -> Array:
         return evaluate_on_device(

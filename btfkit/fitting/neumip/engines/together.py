@@ -67,15 +67,15 @@ class Together(Engine[Part]):
     def parameters(self) -> tuple[Array, Array]:
         return self._engine.parameters()
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> dict[str, Array]:
         return self._engine.state()
 
-    def restore(self, state: Mapping[str, Tensor]) -> None:
+    def restore(self, state: Mapping[str, Array]) -> None:
         with uninterrupted():
             self._tell(_RESTORE)
             # A state may hold more than its engine's.
             for name in sorted(self._engine.state()):
-                self._all.tell(state[name].to(self._all.place, copy=True))
+                self._all.tell(torch.tensor(state[name], device=self._all.place))
             self._engine.restore(state)
 
     def answers(self, material: NeuMIPMaterial, held: Batch) -> Array:
@@ -103,8 +103,9 @@ def follow(engine: Engine[Any], processes: Processes) -> None:
     while (message := processes.tell(empty.clone()).tolist())[0] != _END:
         if message[0] == _RESTORE:
             state = engine.state()
-            told = {n: processes.tell(state[n].to(processes.place)) for n in sorted(state)}
-            engine.restore({name: tensor.cpu() for name, tensor in told.items()})
+            place = processes.place
+            told = {n: processes.tell(torch.tensor(state[n], device=place)) for n in sorted(state)}
+            engine.restore({name: tensor.cpu().numpy() for name, tensor in told.items()})
         else:
             number, count = int(message[1]), int(message[2])
             batch = engine.batch(number, count)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from btfkit.conventions import FLATTEST, KERNEL_INPUTS, LOOKS, STEEPEST
-from btfkit.fitting.neumip.engines.base import Gradients, Tensors
+from btfkit.fitting.neumip.engines.gradients import Gradients, Tensors
 from btfkit.native.neural.layout import Layout, Network
 
 Matrix = Literal["fp32", "tf32", "bf16", "fp16"]
