@@ -13,7 +13,6 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,84 +23,104 @@ from btfkit.btf import BTF, Wrap
 from btfkit.errors import FitError, FormatError
 from btfkit.files import refuse_existing
 from btfkit.fitting.neubtf import augment
-from btfkit.fitting.neubtf.carrier import CARRIERS, errors_in
+from btfkit.fitting.neubtf.beside import put_together, read_beside
+from btfkit.fitting.neubtf.carrier import CARRIERS, Asked, errors_in
 from btfkit.fitting.neubtf.data import frontal_slice
 from btfkit.fitting.neubtf.guides import Window
-from btfkit.io import images
+from btfkit.fitting.neubtf.pictures import opaque, prepare, read_guidance
 from btfkit.materials import file
 from btfkit.materials.base import Header, Material
+from btfkit.materials.neubtf.composite import Composite
 from btfkit.materials.neubtf.material import AnyNeuBTF
+from btfkit.relief.normalmap import Green
 
 Array = NDArray[np.float32]
-Carried = Callable[[torch.Tensor, Header], AnyNeuBTF]
-# A guidance of more texels needs more memory for its encoder than most machines have.
-_MOST_TEXELS = 1 << 25
+Carried = Callable[[torch.Tensor, Header, Asked], AnyNeuBTF]
 _COMPARED = 256
 
 
 def propagate(
     guidance: str | os.PathLike[str] | Array,
-    model: str | os.PathLike[str],
+    model: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
     scale: float = 1.0,
     tileable: bool = False,
     wrap: Wrap | None = None,
+    normals: str | os.PathLike[str] | Array | None = None,
+    green: Green = "up",
+    mask: str | os.PathLike[str] | NDArray[Any] | None = None,
     out: str | os.PathLike[str] | None = None,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
-) -> AnyNeuBTF:
+) -> AnyNeuBTF | Composite:
     """The NeuBTF of `model` on another structure.
 
     Args:
         guidance: an image file, or (h, w, c) linear values in 0..1; grey is repeated. A NeuBTF has
             no opacity: where alpha is 0 the mean colour is taken, with a warning.
-        model: a NeuBTF file with its encoder.
+        model: a NeuBTF file with its encoder; several with a mask.
         scale: the guidance is resized by this first; within the scales of the training (a quarter
             to one, unless it was set otherwise) the material scales with it.
-        tileable: make the guidance tile first.
+        tileable: make the guidance tile first; normals and mask follow it.
         wrap: whether the guidance tiles; None takes "wrap" where it was made to, else "clamp".
+        normals: a normal map of the guidance, a file or (h, w, 3): heights follow its slopes.
+        green: which way the y axis of the normal map runs.
+        mask: a picture of the guidance's size, a file or (h, w), with as many values as there are
+            models: the darkest stands for the first.
         out: file to write, without the encoder; None writes nothing.
         force: whether an existing `out` is replaced.
         progress: called with (stages done, stages).
 
     Raises:
-        FitError: the model has no encoder, or one that was never trained.
+        FitError: the model has no encoder, or one that was never trained; or it has no heights for
+            normals or a mask.
         FormatError: the guidance or the model cannot be read.
-        ValueError: a guidance with no size, too large, or with channels that no image has.
+        ValueError: a guidance with no size, too large, or with channels that no image has; normals
+            or a mask of another size; a mask whose values are not one a model.
     """
     final = None if out is None else refuse_existing(out, force=force)
-    material, onto = _fitted(model)
-    image, name = _image(guidance)
+    models = [model] if isinstance(model, (str, os.PathLike)) else list(model)
+    fitted = [_fitted(path) for path in models]
+    image, name = read_guidance(guidance)
+    beside = read_beside(
+        image.shape[:2], normals=normals, green=green, mask=mask,
+        models=[os.fspath(path) for path in models],
+    )  # fmt: skip
     if progress:
         progress(1, 4)
     if image.ndim == 3 and image.shape[2] in (2, 4):
-        image = _opaque(image)
+        image = opaque(image)
     if tileable:
-        from btfkit.synthesis import make_tileable
+        from btfkit.synthesis import tile_image
 
-        image = make_tileable(image)
+        image, tiling = tile_image(image, peak=1.0)
+        beside = beside.moved(tiling.index.of)
     chosen: Wrap = wrap or ("wrap" if tileable else "clamp")
     prepared = prepare(image, scale=scale, wrap=chosen == "wrap")
+    grid = (int(prepared.shape[2]), int(prepared.shape[3]))
+    beside = beside.resized(grid, wrap=chosen == "wrap")
     if progress:
         progress(2, 4)
-    texel_mm = material.header.texel_mm
-    header = replace(
-        material.header,
-        grid=(int(prepared.shape[2]), int(prepared.shape[3])),
-        wrap=chosen,
-        texel_mm=None if texel_mm is None else texel_mm / scale,
-        provenance={
-            **material.header.provenance,
-            "propagated": {
-                "guidance": name,
-                "model": os.fspath(model),
-                "scale": scale,
-                "tileable": tileable,
-                "transfer": "sRGB encoded, standardised per channel, as in training",
-            },
-        },
-    )
-    carried = onto(prepared, header)
+    told = {
+        "guidance": name,
+        "model": [os.fspath(path) for path in models] if len(models) > 1 else os.fspath(models[0]),
+        "scale": scale,
+        "tileable": tileable,
+        "transfer": "sRGB encoded, standardised per channel, as in training",
+        **beside.told,
+    }
+    parts = []
+    for material, onto in fitted:
+        texel_mm = material.header.texel_mm
+        header = replace(
+            material.header,
+            grid=grid,
+            wrap=chosen,
+            texel_mm=None if texel_mm is None else texel_mm / scale,
+            provenance={**material.header.provenance, "propagated": told},
+        )
+        parts.append(onto(prepared, header, Asked(slope=beside.slope)))
+    carried = parts[0] if beside.labels is None else put_together(parts, beside.labels)
     if progress:
         progress(3, 4)
     if final is not None:
@@ -118,24 +137,30 @@ def errors_carried(
     pairs: NDArray[np.intp] | None = None,
     window: Sequence[int] | None = None,
 ) -> dict[str, float]:
-    """Errors of what the encoder alone makes of a BTF's own mean frontal slice.
+    """Errors of what is made of a BTF's own mean frontal slice as if it were another's.
 
     Args:
         model: a NeuBTF file with its encoder. btf: data of the same kind of sample.
         pairs: that are compared; None takes all.
-        window: top, left, height and width of the texels that are; None takes all.
+        window: top, left, height and width of the texels that are, of the sample that was fitted:
+            from there nothing is copied. None takes all, of another sample.
 
     Returns:
-        `psnr_carried` and `psnr_log1p_carried`; empty where nothing is measured.
+        `psnr_carried`, `psnr_log1p_carried`, and `copied`, the share that was copied from the
+        sample, where any was; empty where nothing is measured.
     """
     _, onto = _fitted(model)
     every = np.arange(len(btf))
     chosen = every if pairs is None else pairs
     rest = every if pairs is None or len(pairs) == len(btf) else np.setdiff1d(every, pairs)
     frontal = augment.three_channels(frontal_slice(btf, rest))
-    carried = onto(augment.encoded(frontal)[None], Header.of(btf))
+    own = None if window is None else Window(*window)
+    carried = onto(augment.encoded(frontal)[None], Header.of(btf), Asked(left_out=own))
     _, h, w, _ = btf.shape
-    return errors_in(carried, btf, chosen, Window(*(window or (0, 0, h, w))))
+    found = errors_in(carried, btf, chosen, own or Window(0, 0, h, w))
+    if found and "copied" in carried.header.provenance:
+        found["copied"] = carried.header.provenance["copied"]
+    return found
 
 
 def has_encoder(path: str | os.PathLike[str]) -> bool:
@@ -147,36 +172,6 @@ def has_encoder(path: str | os.PathLike[str]) -> bool:
     return described["model"] in CARRIERS and any(
         name.startswith(file.TRAINING + "encoder.") for name in described["shapes"]
     )
-
-
-def prepare(image: Array, *, scale: float = 1.0, wrap: bool = False) -> torch.Tensor:
-    """(1, 3, h, w) sRGB encoded guidance of a linear (h, w, c) image, resized by `scale`.
-
-    Raises:
-        ValueError: no size, too large, or channels that no image has.
-    """
-    if image.ndim != 3 or min(image.shape[:2]) < 1:
-        raise ValueError(f"guidance has shape {image.shape}; expected (h, w, c)")
-    h, w, c = image.shape
-    if c in (2, 4):
-        image = _opaque(image)
-    elif c not in (1, 3):
-        raise ValueError(f"guidance has {c} channels; expected 1 (grey) or 3 (RGB)")
-    if not 0 < scale < 1e3:
-        raise ValueError(f"scale = {scale}; expected a positive factor")
-    size = (max(1, round(h * scale)), max(1, round(w * scale)))
-    if size[0] * size[1] > _MOST_TEXELS:
-        raise ValueError(f"guidance of {size[0]} x {size[1]}; at most {_MOST_TEXELS} texels")
-    bad = ~np.isfinite(image)
-    if bad.any():
-        warnings.warn(
-            f"{bad.any(axis=-1).sum()} guidance texels are not finite: taken as mean", stacklevel=3
-        )
-        image = np.where(
-            bad, np.nanmean(np.where(bad, np.nan, image)) if not bad.all() else 0, image
-        )
-    tensor = torch.from_numpy(np.ascontiguousarray(image, np.float32)).permute(2, 0, 1)[None]
-    return augment.resized(augment.encoded(augment.three_channels(tensor)), size, wrap=wrap)
 
 
 def consistency(
@@ -192,7 +187,7 @@ def consistency(
     from btfkit import directions, metrics
     from btfkit.materials.evaluation import texel_centres
 
-    image = _middle(_image(guidance)[0])
+    image = _middle(read_guidance(guidance)[0])
     fine = propagate(image, model)
     coarse = propagate(image, model, scale=scale)
     table = directions.bonn81()[[0, 20, 40]]
@@ -233,7 +228,9 @@ def _fitted(path: str | os.PathLike[str]) -> tuple[Material, Carried]:
         carrier: Any = CARRIERS[material.model].of(arrays)
     except (KeyError, RuntimeError, ValueError) as error:
         raise FormatError(path, f"the encoder does not fit this version ({error})") from error
-    return material, lambda guidance, header: carrier.carried(material, guidance, header)
+    return material, lambda guidance, header, asked: carrier.carried(
+        material, guidance, header, asked
+    )
 
 
 def _check_trained(path: str | os.PathLike[str], material: Material) -> None:
@@ -248,30 +245,3 @@ def _check_trained(path: str | os.PathLike[str], material: Material) -> None:
             remedy="go on with it: btfkit fit --model neubtf --resume, or fit anew for longer",
         )
     warnings.warn(f"{os.fspath(path)} is of a fit that ended early: {encoder}", stacklevel=4)
-
-
-def _image(guidance: str | os.PathLike[str] | Array) -> tuple[Array, Any]:
-    if isinstance(guidance, np.ndarray):
-        return guidance.astype(np.float32), "an array"
-    path = Path(guidance)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such image")
-    image = images.decode(path.name, path.read_bytes(), transfer="srgb", assumed=True)
-    alpha = image.coverage
-    if alpha is None:
-        return image.linear, str(path)
-    return np.concatenate([image.linear, alpha[..., None]], axis=2), str(path)
-
-
-def _opaque(image: Array) -> Array:
-    """(h, w, 1 or 3) colours of an image whose last channel is alpha."""
-    colours, clear = image[..., :-1], ~(image[..., -1] > 0)
-    warnings.warn(
-        f"the guidance has alpha, and a NeuBTF no opacity: {int(clear.sum())} texels that are "
-        f"clear throughout take the mean colour, the others are taken for opaque",
-        stacklevel=3,
-    )
-    if clear.all():
-        return colours
-    mean = colours[~clear].mean(axis=0)
-    return np.where(clear[..., None], mean, colours).astype(np.float32)

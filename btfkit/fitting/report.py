@@ -109,4 +109,6 @@ class FitReport:
         some = f" ({pairs} of {of} pairs)" if pairs != of else ""
         carried = self.errors.get("psnr_carried")
         onto = "" if carried is None else f", carried onto unseen texels {carried:.2f} dB"
+        if self.errors.get("copied"):
+            onto += f" ({100 * self.errors['copied']:.0f} % copied)"
         return f"held-out PSNR {psnr:.2f} dB{some}{onto}"

@@ -14,6 +14,7 @@ MODELS: dict[str, str] = {
     "rainer20": "btfkit.materials.rainer:Rainer20",
     "neubtf": "btfkit.materials.neubtf.material:NeuBTF",
     "neubtf-paper": "btfkit.materials.neubtf.paper:NeuBTFPaper",
+    "composite": "btfkit.materials.neubtf.composite:Composite",
     "neumip": "btfkit.materials.neumip.material:NeuMIP",
     "neumip-paper": "btfkit.materials.neumip.material:NeuMIPPaper",
     "student": "btfkit.materials.neumip.material:Student",

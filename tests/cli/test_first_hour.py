@@ -795,15 +795,15 @@ def test_guidance_that_is_clear_in_places_says_what_becomes_of_them() -> None:
 
 
 def test_alpha_of_a_picture_is_seen(tmp_path: Path) -> None:
-    from btfkit import propagation
+    from btfkit.fitting.neubtf import pictures
 
     codes = np.full((8, 8, 4), 200, np.uint8)
     codes[..., 3] = 255
     drawn(tmp_path / "opaque.png", codes)
-    assert propagation._image(tmp_path / "opaque.png")[0].shape == (8, 8, 3)
+    assert pictures.read_guidance(tmp_path / "opaque.png")[0].shape == (8, 8, 3)
     codes[2, 3, 3] = 0
     drawn(tmp_path / "clear.png", codes)
-    alpha = propagation._image(tmp_path / "clear.png")[0][..., 3]
+    alpha = pictures.read_guidance(tmp_path / "clear.png")[0][..., 3]
     assert (alpha == 0).sum() == 1
     assert alpha[2, 3] == 0
 

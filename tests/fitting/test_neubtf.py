@@ -16,13 +16,14 @@ import btfkit
 from btfkit import propagation
 from btfkit.btf import BTF
 from btfkit.errors import FitError, FormatError
-from btfkit.fitting import fit, loop
-from btfkit.fitting.neubtf import augment, carrier, muon
+from btfkit.fitting import fit, loop, training
+from btfkit.fitting.neubtf import augment, carrier, copying, muon
 from btfkit.fitting.neubtf import encoder as encoders
 from btfkit.fitting.neubtf import paper as published
 from btfkit.fitting.neubtf import trainable as neubtf
 from btfkit.fitting.neubtf.data import frontal_slice
 from btfkit.fitting.neubtf.encoder import STRIDE, Encoder
+from btfkit.fitting.neumip.engines.device import OnDevice
 from btfkit.footprint import gaussian
 from btfkit.materials import file
 from btfkit.materials.evaluation import texel_centres
@@ -209,7 +210,14 @@ def test_a_corrupted_encoder_shows_in_an_evaluation(
         for path in (untied, tmp_path / "bad.safetensors")
     )
     assert good["psnr_carried"] > bad["psnr_carried"] + 1
-    assert set(good) == {"psnr_carried", "psnr_log1p_carried"}
+    assert {"psnr_carried", "psnr_log1p_carried"} <= set(good)
+    # The same quarter as in the report, from which nothing is copied, either.
+    window = json.loads(untied.with_name("untied.neubtf.report.json").read_text())["carried_window"]
+    good, bad = (
+        propagation.errors_carried(path, tiny, pairs=test, window=window)
+        for path in (untied, tmp_path / "bad.safetensors")
+    )
+    assert good["psnr_carried"] > bad["psnr_carried"] + 1
 
 
 def test_eval_states_own_and_carried(
@@ -252,6 +260,30 @@ def test_equal_seed_and_steps_give_equal_bytes_and_resume_goes_the_same_way(
         np.testing.assert_array_equal(array, (btfkit.load(part).weights | theirs)[name])
 
 
+@pytest.mark.parametrize(("model", "settings"), [("neubtf", TINY), ("sbtf", {"batch": "1024"})])
+def test_on_a_device_the_same_is_trained_wherever_what_is_read_is_a_copy(
+    model: str, settings: dict[str, str], tiny: BTF, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A GPU that is the CPU under another name, whose parameters are not the CPU's.
+    for module in (training, fit):
+        monkeypatch.setattr(module, "gpu", lambda: "cpu:0")
+    read = OnDevice.parameters
+    monkeypatch.setattr(OnDevice, "parameters", lambda self: tuple(a.copy() for a in read(self)))
+    ours, theirs = (
+        fit.fit(tiny, model=model, steps=24, device=device, settings=settings)
+        for device in ("cuda", "cpu")
+    )
+    assert (ours.device, theirs.device) == ("cpu:0", "cpu")
+    # Both sum in float32, in another order, 24 times.
+    for name in ("psnr", *(["psnr_carried"] if model == "neubtf" else [])):
+        assert ours.errors[name] == pytest.approx(theirs.errors[name], abs=0.1)
+    one, two = (report.material.weights["texture.heights"] for report in (ours, theirs))
+    np.testing.assert_allclose(one, two, atol=2e-3)
+    if model == "neubtf":
+        held = [report.material.weights["texture.0.0"][..., 6:] for report in (ours, theirs)]
+        np.testing.assert_array_equal(held[0], held[1])
+
+
 def test_group_24_no_steps_one_pair_one_texel_and_no_test_still_end_in_a_model(tiny: BTF) -> None:
     assert fit.fit(tiny, model="neubtf", steps=0).untrained
     assert fit.fit(tiny.subset([4]), model="neubtf", steps=6, settings=TINY).errors == {}
@@ -279,6 +311,7 @@ def test_texels_that_are_not_measured_are_masked_and_counted(tiny: BTF) -> None:
         ({"precision": "int8"}, "precision = 'int8'; expected float16 or float32"),
         ({"free": "1"}, "free = 1.0; expected more than 0 and less than 1"),
         ({"tied": "3"}, "tied = 3; expected 0 to 2"),
+        ({"turned": "1"}, "turned = 1.0; expected 0 to less than 1"),
         ({"rate": "0"}, "rate = 0.0; expected more than 0, up to 1"),
         ({"frontal": "2"}, "frontal = 2.0; expected 0 to 1"),
         ({"crop": "0"}, "crop and pool_mb must be at least 1"),
@@ -289,6 +322,125 @@ def test_settings_that_make_no_sense_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         fit.fit(tiny, model="neubtf", steps=1, settings=given)
+
+
+def test_heights_are_taught_turned_and_features_are_not(tiny: BTF) -> None:
+    image = torch.rand(1, 2, 8, 12, generator=generator())
+    seen = [neubtf.turned(image, turn) for turn in range(8)]
+    assert {tuple(part.shape[2:]) for part in seen} == {(8, 12), (12, 8)}
+    squares = [neubtf.turned(image[..., :8], turn) for turn in range(8)]
+    assert all((a != b).any() for k, a in enumerate(squares) for b in squares[:k])
+    torch.testing.assert_close(seen[2], image.flip((2, 3)))
+    for share, heights_alone in (("0", False), ("0.999", True)):
+        model = begun(tiny, turned=share, guessed="0")
+        for progress in (0.0, 0.27, 0.5):
+            model.step(progress)
+        # Four texels of every channel; Adam does not move what has no gradient.
+        moved = model.encoder.out.bias.detach().view(7, 4).abs().sum(1)
+        assert moved[0] > 0
+        assert (moved[1:] == 0).all() == heights_alone
+
+
+# --- what is copied from the sample ---------------------------------------------------------------
+
+
+def smooth(k: int, h: int, w: int) -> torch.Tensor:
+    """(k, h, w) without a period."""
+    coarse = torch.rand(1, k, h // 4, w // 4, generator=generator())
+    return augment.resized(coarse, (h, w), wrap=True)[0]
+
+
+def test_what_the_sample_shows_itself_is_copied_texel_by_texel(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(copying, "_VOTERS", 1)
+    answer, channels = smooth(3, 32, 48), torch.rand(3, 32, 48, generator=generator())
+    copier = copying.Copier.of(answer, channels, wrap=True)
+    assert copier is not None
+    for shift in ((0, 0), (8, 16), (3, 5)):
+        moved = encoders.in_parts(copier, answer.roll(shift, (1, 2))[None], wrap=True)[0]
+        # One vote a texel, from where it was: float32 means of equal numbers.
+        torch.testing.assert_close(moved[:-1], channels.roll(shift, (1, 2)), atol=1e-5, rtol=0)
+        # Rounding of squares in float32
+        assert moved[-1].max() < 1e-2
+
+
+@pytest.mark.parametrize("wrap", [True, False])
+def test_copied_in_parts_is_copied_whole(wrap: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    copier = copying.Copier.of(smooth(3, 32, 32), torch.rand(3, 32, 32), wrap=wrap)
+    asked = smooth(3, 96, 80)[None]
+    assert copier is not None
+    whole = encoders.in_parts(copier, asked, wrap=wrap)
+    monkeypatch.setattr(encoders, "_PART", 32)
+    torch.testing.assert_close(encoders.in_parts(copier, asked, wrap=wrap), whole)
+
+
+def test_nothing_is_copied_from_what_is_left_out_nor_over_a_border() -> None:
+    answer, channels = smooth(2, 40, 40), torch.rand(2, 40, 40, generator=generator())
+    kept = carrier.inside(neubtf.Window(10, 10, 20, 20), (40, 40))
+    channels[:, kept] = torch.nan
+    copier = copying.Copier.of(answer, channels, wrap=True, left_out=kept)
+    assert copier is not None
+    assert copier(answer[None]).isfinite().all()
+    within = copying.Copier.of(answer, channels, wrap=False)
+    assert within is not None
+    assert within.places.min() == 4
+    assert within.places.max() == 35
+    assert copying.Copier.of(answer[:, :6], channels[:, :6], wrap=False) is None
+
+
+def test_copies_count_by_what_they_would_have_bettered_and_fade_where_nothing_is_near() -> None:
+    drawn = generator()
+    wanted = torch.rand(3, 24, 24, generator=drawn)
+    wrong = wanted + torch.randn(3, 24, 24, generator=drawn)
+    everywhere, far = torch.ones(24, 24, dtype=torch.bool), torch.full((1, 24, 24), 2.0)
+    # The encoder is right in channel 0, the copy in channel 1, both are equally wrong in 2.
+    other = wanted + torch.randn(3, 24, 24, generator=drawn)
+    answer = torch.stack([wanted[0], wrong[1], wrong[2]])
+    copied = torch.cat([torch.stack([other[0], wanted[1], other[2]]), far])
+    mix = copying.Mix.measured(answer, copied, wanted, everywhere, torch.ones(3))
+    # 576 texels and a pull of 10 of them
+    np.testing.assert_allclose(mix.share, [0, 1, 0.5], atol=0.06)
+    assert mix.near == 2
+    found, share = mix(answer, copied)
+    assert share == pytest.approx(0.5, abs=0.03)
+    assert (found[1] - wanted[1]).abs().mean() < 0.02
+    copied[-1] = 40
+    found, share = mix(answer, copied)
+    # (2 / 40) squared of the way
+    assert (found - answer).abs().max() < 0.01 * (copied[:-1] - answer).abs().max()
+    assert share < 0.005
+
+
+def test_files_hold_what_is_copied_from_and_propagation_says_how_much(
+    tiny: BTF, untied: Path, tmp_path: Path
+) -> None:
+    report = json.loads(untied.with_name("untied.neubtf.report.json").read_text())
+    assert 0 < report["copied"] <= 1
+    arrays = file.training_arrays(untied)
+    again = carrier.Carrier.of(arrays).arrays()
+    assert again.keys() == arrays.keys()
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(again[name], array)
+    picture = guidance_of(tiny)[0].permute(1, 2, 0).numpy() ** 2.2
+    alike, strange = (
+        propagation.propagate(image, untied, wrap="wrap")
+        for image in (picture, np.random.default_rng(0).random((32, 32, 3)).astype(np.float32))
+    )
+    shares = [m.header.provenance.get("copied", 0.0) for m in (alike, strange)]
+    # Noise shows nothing of the sample.
+    assert shares[0] > shares[1]
+    without = {name: a for name, a in arrays.items() if not name.startswith("copying.")}
+    file.save(btfkit.load(untied), tmp_path / "encoder.safetensors", training=without)
+    alone = propagation.propagate(picture, tmp_path / "encoder.safetensors", wrap="wrap")
+    assert "copied" not in alone.header.provenance
+    fit.fit(
+        tiny, model="neubtf", steps=8, settings=TINY | {"copied": "false"},
+        out=tmp_path / "none.safetensors",
+    )  # fmt: skip
+    assert not any(
+        n.startswith("copying.") for n in file.training_arrays(tmp_path / "none.safetensors")
+    )
 
 
 # --- other guidance ------------------------------------------------------------------------------
@@ -322,6 +474,63 @@ def test_guidance_of_any_size_and_scale_is_carried(fitted: Path) -> None:
             assert np.isfinite(answer.reflectance).all()
     half = propagation.propagate(rng.random((40, 64, 3)).astype(np.float32), fitted, scale=0.5)
     assert half.header.grid == (20, 32)
+
+
+GUIDES: dict[str, np.ndarray] = {
+    "constant": np.full((24, 24, 3), 0.3, np.float32),
+    "black": np.zeros((24, 24, 3), np.float32),
+    "one texel": np.full((1, 1, 3), 0.3, np.float32),
+    "one row": np.linspace(0, 1, 600, dtype=np.float32).reshape(1, 200, 3),
+    "hdr": np.random.default_rng(0).random((24, 24, 3)).astype(np.float32) * 1e4,
+    "one bright texel": np.eye(24, dtype=np.float32)[..., None].repeat(3, 2)[:1] * 1e6,
+    "below zero": np.random.default_rng(0).random((24, 24, 3)).astype(np.float32) - 0.5,
+    "grey": np.random.default_rng(0).random((24, 24, 1)).astype(np.float32),
+}
+
+
+@pytest.mark.parametrize("kind", GUIDES)
+@pytest.mark.parametrize("wrap", ["wrap", "clamp"])
+def test_group_23_a_guidance_that_shows_nothing_or_too_much_is_carried_and_copied_finite(
+    kind: str, wrap: Any, untied: Path
+) -> None:
+    carried = propagation.propagate(GUIDES[kind], untied, wrap=wrap)
+    assert carried.header.grid == GUIDES[kind].shape[:2]
+    for array in carried.weights.values():
+        assert np.isfinite(array.astype(np.float32)).all()
+    at = np.random.default_rng(0).random((50, 2))
+    answer = carried.evaluate(at, [0, 0.3, 0.9], [0.2, 0, 0.9]).reflectance
+    assert np.isfinite(answer).all()
+    # Nothing of it lies far from what the sample answers: features come from it, or from a decoder
+    # and an encoder in the range they were taught.
+    assert answer.max() < 20
+
+
+def test_group_23_transparent_guidance_is_said_and_what_is_no_picture_is_refused(
+    untied: Path,
+) -> None:
+    clear = np.random.default_rng(0).random((16, 16, 4)).astype(np.float32)
+    clear[:4, :, 3] = 0
+    with pytest.warns(UserWarning, match="no opacity: 64 texels that are clear throughout"):
+        carried = propagation.propagate(clear, untied)
+    assert carried.header.grid == (16, 16)
+    for picture, message in (
+        (np.zeros((8, 8, 5), np.float32), "guidance has 5 channels; expected 1"),
+        (np.zeros((0, 8, 3), np.float32), "expected"),
+        (np.zeros((8, 8), np.float32), r"shape \(8, 8\); expected \(h, w, c\)"),
+        (np.broadcast_to(np.float32(0), (8000, 8000, 3)), "guidance of 8000 x 8000; at most"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            propagation.propagate(picture, untied)
+
+
+def test_group_24_one_view_and_few_texels_are_fitted_and_carried(tiny: BTF, tmp_path: Path) -> None:
+    view = np.flatnonzero((tiny.view == tiny.view[0]).all(axis=1))
+    few = tiny.subset(view).crop(slice(0, 3), slice(0, 5))
+    report = fit.fit(few, model="neubtf", steps=12, settings=TINY, out=tmp_path / "m.safetensors")
+    assert all(math.isfinite(value) for value in report.errors.values() if isinstance(value, float))
+    with pytest.warns(UserWarning, match="ended early"):
+        carried = propagation.propagate(GUIDES["grey"], tmp_path / "m.safetensors")
+    assert "copied" not in carried.header.provenance
 
 
 def test_a_tile_keeps_its_heights_in_texels(fitted: Path) -> None:

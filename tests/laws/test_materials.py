@@ -395,7 +395,7 @@ def test_the_program_of_a_model_answers_as_the_model_does(model: str) -> None:
     json.dumps(program.described())
 
 
-@pytest.mark.parametrize("model", sorted(set(materials.MODELS) - set(materials.PROGRAMS)))
+@pytest.mark.parametrize("model", sorted(set(MODELS) - set(materials.PROGRAMS)))
 def test_a_measured_model_names_those_that_have_a_program(model: str) -> None:
     with pytest.raises(TypeError, match=rf"{model} blends measured pairs .* lambert, rainer19"):
         fitted(model).program()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -13,18 +13,41 @@ from torch import Tensor
 
 from btfkit import metrics
 from btfkit.btf import BTF
+from btfkit.errors import FitError
 from btfkit.fitting.neubtf import augment, unet
-from btfkit.fitting.neubtf.encoder import STRIDE, Encoder, encode_in_tiles
+from btfkit.fitting.neubtf.copying import Copier, Mix
+from btfkit.fitting.neubtf.encoder import STRIDE, Encoder, encode_in_tiles, in_parts
 from btfkit.fitting.neubtf.guides import Window, encode, multiple
 from btfkit.materials.base import Array, Header, Material
 from btfkit.materials.evaluation import answer_pair
 from btfkit.materials.neubtf.material import NeuBTF
 from btfkit.materials.neubtf.paper import NeuBTFPaper
+from btfkit.materials.neumip.material import NeuMIPMaterial
+from btfkit.relief.integration import integrate
 
 # Deviation of the features that the guidance itself gives.
 _TIED = 0.3
+# Weight of the encoder's heights beside that of slopes: what they are off by is wide, and lies
+# between stones more than in them.
+_BY_ENCODER = 0.01
 # Channels of the guidance, and whether it is the mean of many lights.
 INPUTS = 4
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What is asked of carrying beside the guidance.
+
+    Attributes:
+        averaged: whether the guidance is a mean over many lights.
+        left_out: what of the sample must not be copied.
+        slope: (h, w, 2) dz/dx and dz/dy that heights follow, y up, NaN where unknown.
+    """
+
+    averaged: bool = True
+    left_out: Window | None = None
+    slope: Array | None = None
 
 
 @final
@@ -36,12 +59,16 @@ class Carrier:
         encoder: of standardised guidance and its kind: heights, then free features.
         mean, deviation: (1 + free,) of heights in texels and of the free features.
         axes: (tied, 3) colour directions, whose components of the guidance are the last features.
+        guidance: (1, 3, h, w) the sample's own, sRGB encoded. mix: how much is copied from what
+            was fitted there. None where nothing is.
     """
 
     encoder: Encoder
     mean: Tensor
     deviation: Tensor
     axes: Tensor
+    guidance: Tensor | None = None
+    mix: Mix | None = None
 
     @staticmethod
     def of(arrays: Mapping[str, NDArray[Any]]) -> Carrier:
@@ -51,46 +78,134 @@ class Carrier:
         )
         encoder = Encoder(INPUTS, len(mean), torch.Generator())
         encoder.load_state_dict(_encoder_of(arrays))
-        return Carrier(encoder.eval(), mean, deviation, axes)
+        mix, guidance = Mix.of(arrays), None
+        if mix is not None:
+            guidance = torch.from_numpy(arrays["copying.guidance"].astype(np.float32))
+        return Carrier(encoder.eval(), mean, deviation, axes, guidance, mix)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All of it by name, as files hold it."""
         named = {f"encoder.{name}": value for name, value in self.encoder.state_dict().items()}
         named |= {"mean": self.mean, "deviation": self.deviation, "axes": self.axes}
-        return {name: value.detach().numpy().copy() for name, value in named.items()}
+        found = {name: value.detach().numpy().copy() for name, value in named.items()}
+        if self.mix is not None and self.guidance is not None:
+            found |= self.mix.arrays()
+            found["copying.guidance"] = self.guidance.numpy().astype(np.float16)
+        return found
 
-    def textures(
-        self, guidance: Tensor, *, wrap: bool, averaged: bool = True
-    ) -> tuple[Array, Array]:
-        """Heights (h, w) in texels, and features (h, w, free + tied), of a guidance.
+    def answer(self, guidance: Tensor, *, wrap: bool, averaged: bool = True) -> Tensor:
+        """(1, 1 + free, h, w) what the encoder says of a guidance, standardised.
+
+        Of a periodic guidance that the stride does not divide, resampled to the nearest that it
+        does.
 
         Args:
             guidance: (1, 3, h, w) sRGB encoded, 0..1.
             wrap: whether it is periodic. averaged: whether it is a mean over many lights.
         """
         h, w = guidance.shape[-2:]
-        # A periodic guidance that the stride does not divide is resampled, and its textures back.
         even = wrap and (h % STRIDE or w % STRIDE)
         size = (multiple(h), multiple(w)) if even else (h, w)
         with torch.no_grad():
             seen = augment.standardised(augment.resized(guidance, size, wrap=wrap))
-            answer = encode_in_tiles(self.encoder, of_kind(seen, averaged), wrap=wrap)
+            return encode_in_tiles(self.encoder, of_kind(seen, averaged), wrap=wrap)
+
+    def standardised(self, material: NeuMIPMaterial) -> Tensor:
+        """(1 + free, h, w) heights and free features of a material of the sample."""
+        free = len(self.mean) - 1
+        heights = material.weights["texture.heights"].astype(np.float32)
+        texels = heights * (material.spec.depth_scale * material.spec.size[1])
+        features = material.weights["texture.0.0"][..., :free].astype(np.float32)
+        found = torch.from_numpy(np.concatenate([texels, features], axis=-1))
+        return ((found - self.mean) / self.deviation).permute(2, 0, 1)
+
+    def copier(self, material: NeuMIPMaterial, left_out: Window | None = None) -> Copier | None:
+        """The sample that was fitted, to be copied from; None where nothing is copied.
+
+        Args:
+            material: of the sample. left_out: what of it must not be copied.
+        """
+        if self.mix is None or self.guidance is None:
+            return None
+        wrap = material.header.wrap == "wrap"
+        answer = self.answer(self.guidance, wrap=wrap)
+        size: tuple[int, int] = (answer.shape[2], answer.shape[3])
+        channels = augment.resized(self.standardised(material)[None], size, wrap=wrap)[0]
+        barred = None
+        if left_out is not None:
+            shown = inside(left_out, self.guidance.shape[-2:]).float()[None, None]
+            barred = augment.resized(shown, size, wrap=wrap)[0, 0] > 0
+        return Copier.of(self.scaled(answer)[0], channels, wrap=wrap, left_out=barred)
+
+    def mix_of(self, material: NeuMIPMaterial, window: Window, scale: Tensor) -> Mix | None:
+        """How much to copy beside the encoder's answer: what is best where it never saw.
+
+        None where nothing is left to copy from. `guidance` has to be there.
+
+        Args:
+            material: of the sample. window: of it, kept from the encoder. scale: as in `Mix`.
+        """
+        assert self.guidance is not None
+        wrap = material.header.wrap == "wrap"
+        alone = replace(self, mix=Mix.none(scale))
+        copier = alone.copier(material, window)
+        if copier is None:
+            return None
+        answer = alone.answer(self.guidance, wrap=wrap)
+        copied = in_parts(copier, alone.scaled(answer), wrap=wrap)[0]
+        size: tuple[int, int] = (answer.shape[2], answer.shape[3])
+        wanted = augment.resized(self.standardised(material)[None], size, wrap=wrap)[0]
+        shown = inside(window, self.guidance.shape[-2:]).float()[None, None]
+        among = augment.resized(shown, size, wrap=wrap)[0, 0] > 0.5
+        return Mix.measured(answer[0], copied, wanted, among, scale)
+
+    def scaled(self, answer: Tensor) -> Tensor:
+        """An answer (b, k, h, w) as it is compared."""
+        return answer if self.mix is None else answer * self.mix.scale[:, None, None]
+
+    def textures(
+        self, guidance: Tensor, *, wrap: bool, averaged: bool = True, copier: Copier | None = None
+    ) -> tuple[Array, Array, float]:
+        """Heights (h, w) in texels, features (h, w, free + tied), and the share that is copied.
+
+        Args:
+            guidance, wrap, averaged: as in `answer`. copier: the sample; None copies nothing.
+        """
+        h, w = guidance.shape[-2:]
+        answer, copied = self.answer(guidance, wrap=wrap, averaged=averaged), 0.0
+        with torch.no_grad():
+            if copier is not None and self.mix is not None:
+                found = in_parts(copier, self.scaled(answer), wrap=wrap)
+                mixed, copied = self.mix(answer[0], found[0])
+                answer = mixed[None]
             answer = augment.resized(answer, (h, w), wrap=wrap)
-            found = answer[0].permute(1, 2, 0) * self.deviation + self.mean
+            channels = answer[0].permute(1, 2, 0) * self.deviation + self.mean
             tied = tied_features(guidance, self.axes)
-            features = torch.cat([found[..., 1:], tied], dim=-1)
-        return found[..., 0].numpy(), features.numpy()
+            features = torch.cat([channels[..., 1:], tied], dim=-1)
+        return channels[..., 0].numpy(), features.numpy(), copied
 
     def carried(
-        self, material: NeuBTF, guidance: Tensor, header: Header, *, averaged: bool = True
+        self,
+        material: NeuBTF,
+        guidance: Tensor,
+        header: Header,
+        asked: Asked = Asked(),
     ) -> NeuBTF:
-        """A material on another guidance.
+        """A material on another guidance; its provenance says which share was copied.
 
         Args:
             material: what was fitted. guidance: (1, 3, h, w) sRGB encoded, 0..1.
             header: of the new material; its grid is the guidance's size.
         """
-        heights, features = self.textures(guidance, wrap=header.wrap == "wrap", averaged=averaged)
+        wrap = header.wrap == "wrap"
+        heights, features, copied = self.textures(
+            guidance, wrap=wrap, averaged=asked.averaged,
+            copier=self.copier(material, asked.left_out),
+        )  # fmt: skip
+        if asked.slope is not None:
+            known = np.full(heights.shape, _BY_ENCODER)
+            found = integrate(asked.slope, wrap=wrap, known=heights, by_known=known)
+            heights = found.height
         size: tuple[int, int] = (heights.shape[0], heights.shape[1])
         spec = replace(material.spec, size=size)
         weights = {n: a for n, a in material.weights.items() if not n.startswith("texture.")}
@@ -98,6 +213,9 @@ class Carrier:
         scaled = heights / (spec.depth_scale * size[1])
         weights["texture.heights"] = scaled[..., None].astype(kind)
         weights["texture.0.0"] = features.astype(kind)
+        if copied:
+            told = {**header.provenance, "copied": round(copied, 3)}
+            header = replace(header, provenance=told)
         return NeuBTF.of_finest(spec, weights, header)
 
 
@@ -118,8 +236,23 @@ class PaperCarrier:
         encoder.load_state_dict(_encoder_of(arrays))
         return PaperCarrier(encoder.eval(), mean, deviation)
 
-    def carried(self, material: NeuBTFPaper, guidance: Tensor, header: Header) -> NeuBTFPaper:
-        """As `Carrier.carried`."""
+    def carried(
+        self,
+        material: NeuBTFPaper,
+        guidance: Tensor,
+        header: Header,
+        asked: Asked = Asked(),
+    ) -> NeuBTFPaper:
+        """As `Carrier.carried`; nothing is copied.
+
+        Raises:
+            FitError: slopes, of which the published model knows nothing.
+        """
+        if asked.slope is not None:
+            raise FitError(
+                "neubtf-paper has no heights that normals could tell",
+                remedy="fit --model neubtf, or leave --normals out",
+            )
         with torch.no_grad():
             encoded = encode(self.encoder, guidance, wrap=header.wrap == "wrap")
             texture = encoded[0].permute(1, 2, 0) * self.deviation + self.mean
@@ -134,6 +267,14 @@ CARRIERS: dict[str, type[Carrier] | type[PaperCarrier]] = {
     "neubtf": Carrier,
     "neubtf-paper": PaperCarrier,
 }
+
+
+def inside(window: Window, size: Sequence[int]) -> Tensor:
+    """(h, w) whether each texel lies in a window of a grid of that size."""
+    found = torch.zeros(size[0], size[1], dtype=torch.bool)
+    rows = slice(window.top, window.top + window.height)
+    found[rows, window.left : window.left + window.width] = True
+    return found
 
 
 def of_kind(image: Tensor, averaged: bool) -> Tensor:

@@ -55,7 +55,7 @@ def orthogonalised(matrix: Tensor) -> Tensor:
     x = x / x.norm().clamp_min(1e-12)
     # Every iteration multiplies by a polynomial of the Gram matrix; they are gathered, and the wide
     # matrix is multiplied once.
-    gram, factor = x @ x.T, torch.eye(len(x), dtype=x.dtype)
+    gram, factor = x @ x.T, torch.eye(len(x), dtype=x.dtype, device=x.device)
     for _ in range(_ITERATIONS):
         step = b * gram + c * gram @ gram
         step.diagonal().add_(a)

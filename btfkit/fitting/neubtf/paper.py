@@ -242,7 +242,7 @@ class NeuBTFPaper(Trainable):
             target = self._targets(slots, *self._in_grid(rows, cols, guide.window))
         index = self._pool.pairs[slots.numpy()]
         predicted = self._predict(texture, index, rows, cols, size, guide.window)
-        loss = losses.log_l1(predicted, target)
+        loss = s.pixels * losses.log_l1(predicted, target)
         self.queries += target.shape[0] * target.shape[1]
         if s.style or s.frequency:
             loss = loss + self._image_losses(texture, guide)

@@ -43,6 +43,9 @@ class Settings(Guidance):
         free: share of the budget that the free textures and their decoder take.
         tied: features that are colour components of the guidance itself, 0 to 2.
         kept: whether a quarter of the area is kept from the encoder at first, for `psnr_carried`.
+        copied: whether structure may be copied from the sample, as far as that quarter shows that
+            it helps.
+        turned: share of the guides that are turned or mirrored, and tell of heights alone.
         rate: peak learning rate of the encoder.
         batch: queries a step of the first part; 0: by the size of the texture.
         precision: of the saved textures, float16 or float32.
@@ -52,6 +55,8 @@ class Settings(Guidance):
     free: float = 0.25
     tied: int = 2
     kept: bool = True
+    copied: bool = True
+    turned: float = 0.5
     rate: float = 4e-2
     batch: int = 0
     precision: str = "float16"
@@ -63,6 +68,8 @@ class Settings(Guidance):
             raise ValueError(f"precision = {self.precision!r}; expected float16 or float32")
         if not 0 < self.free < 1:
             raise ValueError(f"free = {self.free}; expected more than 0 and less than 1")
+        if not 0 <= self.turned < 1:
+            raise ValueError(f"turned = {self.turned}; expected 0 to less than 1")
         if not 0 <= self.tied <= 2:
             raise ValueError(f"tied = {self.tied}; expected 0 to 2")
         if not 0 < self.rate <= 1:
@@ -82,7 +89,8 @@ class PaperSettings(Guidance):
         pairs, texels: a step renders this many texels under this many pairs.
         latent_rate, renderer_rate, encoder_rate: peak learning rates.
         first, second: shares of the budget that the first two stages take.
-        style, frequency: weights of these losses in the third stage, 0 for none.
+        pixels, style, frequency: weights of the three terms of the loss in the third stage; the
+            paper does not give them, and these are ours.
         precision: of the saved texture, float16 or float32.
     """
 
@@ -99,8 +107,9 @@ class PaperSettings(Guidance):
     first: float = 0.2
     second: float = 0.4
     scales: float = 0.25
-    style: float = 0.0
-    frequency: float = 0.0
+    pixels: float = 1.0
+    style: float = 0.1
+    frequency: float = 0.1
     frontal: float = 0.5
     crop: int = 96
     precision: str = "float16"
@@ -111,5 +120,12 @@ class PaperSettings(Guidance):
             raise ValueError(f"precision = {self.precision!r}; expected float16 or float32")
         if min(self.pairs, self.texels, self.latents) < 1:
             raise ValueError("pairs, texels and latents must be at least 1")
+        if min(self.pixels, self.style, self.frequency) < 0 or not (
+            self.pixels or self.style or self.frequency
+        ):
+            raise ValueError(
+                f"pixels = {self.pixels}, style = {self.style}, frequency = {self.frequency}; "
+                "expected none below 0, and one above"
+            )
         if not (0 < self.first < 1 and 0 <= self.second < 1 - self.first):
             raise ValueError(f"stages take {self.first} and {self.second}; they must leave a rest")

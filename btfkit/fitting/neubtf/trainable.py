@@ -3,8 +3,8 @@
 1. NeuMIP's heights, features and decoder, by its own engine; some features are held equal to the
    guidance's main colours, so that the decoder learns to read these from any guidance.
 2. The encoder, taught to give heights and free features for varied guidance, each weighted by how
-   much the answer depends on it. A quarter of the area is kept from it, tells how well it carries,
-   and is then given back.
+   much the answer depends on it. A quarter of the area is kept from it, tells how well it carries
+   and how much to copy from the sample beside its answers, and is then given back.
 
 The material keeps the free textures: for its own guidance they are the encoder's answer and what
 that lacks. docs/neubtf.md says what was tried.
@@ -12,6 +12,7 @@ that lacks. docs/neubtf.md says what was tried.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, cast, final
@@ -28,12 +29,14 @@ from btfkit.fitting.neubtf import augment
 from btfkit.fitting.neubtf.carrier import (
     ERRORS,
     INPUTS,
+    Asked,
     Carrier,
     colour_axes,
     errors_in,
     of_kind,
     tied_features,
 )
+from btfkit.fitting.neubtf.copying import Mix
 from btfkit.fitting.neubtf.data import frontal_slice
 from btfkit.fitting.neubtf.encoder import Encoder
 from btfkit.fitting.neubtf.guides import Guide, Guides, Window
@@ -45,6 +48,7 @@ from btfkit.fitting.optimisers import Adam, Optimiser
 from btfkit.fitting.schedule import pace
 from btfkit.materials.neubtf.material import NeuBTF as Evaluated
 from btfkit.materials.neumip.material import NeuMIPMaterial
+from btfkit.native.neural.layout import Array
 from btfkit.settings import parsed
 
 # Steps before which an encoder carries little.
@@ -119,7 +123,9 @@ class NeuBTF(Trainable):
         self._mean, self._deviation = torch.zeros(1 + free), torch.ones(1 + free)
         self._weight = torch.ones(1 + free) / (1 + free)
         self._carried: dict[str, float] = {}
-        self._taught, self._level = 0, 0.0
+        self._mix: Mix | None = None
+        self._copied = 0.0
+        self._taught, self._level, self._place = 0, 0.0, "cpu"
         self._wanted: Tensor | None = None
         self.encoder = Encoder(INPUTS, 1 + free, self._generators.torch)
         self._optimisers: dict[str, Optimiser] = {
@@ -141,6 +147,9 @@ class NeuBTF(Trainable):
             self._wanted = self._aim()
         done = (progress - share) / (1 - share)
         if self._kept and done >= _GIVEN_BACK and not self._carried:
+            if self.settings.copied:
+                scale = (self._weight * len(self._weight)).sqrt()
+                self._mix = self.carrier().mix_of(self.material(), self._kept, scale)
             self._carried = self._measured(self._kept)
         return self._teach(done, self._wanted)
 
@@ -159,7 +168,8 @@ class NeuBTF(Trainable):
     def stated(self) -> dict[str, Any]:
         if not self._kept or not self._carried:
             return {}
-        return {**self._carried, "carried_window": list(self._kept)}
+        found = {**self._carried, "carried_window": list(self._kept)}
+        return found | ({"copied": self._copied} if self._mix is not None else {})
 
     def score(self) -> float:
         return self.free.score()
@@ -174,7 +184,18 @@ class NeuBTF(Trainable):
 
     def carrier(self) -> Carrier:
         """The encoder as it stands."""
-        return Carrier(self.encoder, self._mean, self._deviation, self._axes)
+        encoder = self.encoder
+        if self._place != "cpu":
+            encoder = copy.deepcopy(encoder).cpu()
+        return Carrier(encoder, self._mean, self._deviation, self._axes, self._guidance, self._mix)
+
+    def on_device(self, device: str) -> Trainable:
+        """Both parts are trained there; guides are drawn, and quarters measured, on the CPU."""
+        self.free.on_device(device)
+        # In place: the optimisers, which hold no moments yet, go on with the same parameters.
+        self.encoder.to(device)
+        self._place = device
+        return self
 
     def slow_down(self) -> None:
         super().slow_down()
@@ -182,12 +203,15 @@ class NeuBTF(Trainable):
 
     def state(self) -> dict[str, Tensor]:
         found = {f"free.{name}": value for name, value in self.free.state().items()}
-        found |= tensors_of({"encoder": self.encoder}, self._optimisers)
+        own = tensors_of({"encoder": self.encoder}, self._optimisers)
+        found |= {name: value.cpu() for name, value in own.items()}
         found["numbers"] = self._counters(self._taught)
         found |= {"mean": self._mean.clone(), "deviation": self._deviation.clone()}
-        carried = [self._level, *self._carried.values()]
+        carried = [self._level, self._copied, *self._carried.values()]
         if self._wanted is not None:
             found["wanted"] = self._wanted.clone()
+        if self._mix is not None:
+            found |= {n: torch.from_numpy(a) for n, a in self._mix.arrays().items()}
         return found | {
             "weight": self._weight.clone(),
             "carried": torch.tensor(carried, dtype=torch.float64),
@@ -203,18 +227,22 @@ class NeuBTF(Trainable):
         self._mean, self._deviation = state["mean"].clone(), state["deviation"].clone()
         self._weight = state["weight"].clone()
         self._wanted = state["wanted"].clone() if "wanted" in state else None
-        self._level, *carried = state["carried"].tolist()
+        self._mix = Mix.of({n: t.numpy() for n, t in state.items() if n.startswith("copying.")})
+        self._level, self._copied, *carried = state["carried"].tolist()
         self._carried = dict(zip(ERRORS, carried, strict=False))
 
     # --- the two parts ---------------------------------------------------------------------
 
     def _hold(self) -> None:
         """Set the features that are the guidance's own."""
-        if self._tied.shape[-1]:
-            _, texels = self.free.engine.parameters()
-            finest = self.free.layout.textures(texels)[0][0]
-            channels = self.free.layout.banks[0].channels
-            finest[..., channels - self._tied.shape[-1] : channels] = self._tied
+        layout = self.free.layout
+        channels, count = layout.banks[0].channels, self._tied.shape[-1]
+
+        def hold(_: Array, texels: Array) -> None:
+            layout.textures(texels)[0][0][..., channels - count : channels] = self._tied
+
+        if count:
+            self.free.engine.change(hold)
 
     def _aim(self) -> Tensor:
         """What the encoder is taught, (1, 1 + free, h, w) standardised: heights, free features.
@@ -261,13 +289,24 @@ class NeuBTF(Trainable):
     def _teach(self, done: float, aim: Tensor) -> float:
         guide = self._guides.draw()
         wanted, counts = self._lesson(guide, aim)
-        answer = self.encoder(of_kind(guide.image, guide.averaged))
-        square = (self._weight[:, None, None] * (answer - wanted).square()).sum(1, keepdim=True)
+        image, weight = guide.image, self._weight
+        if self._drawn() < self.settings.turned:
+            # A relief turned or mirrored is one; its features, which know directions, are not told.
+            turn = 1 + int(7 * self._drawn())
+            image, wanted, counts = (turned(part, turn) for part in (image, wanted, counts))
+            weight = weight * torch.eye(len(weight))[0]
+        seen = of_kind(image, guide.averaged)
+        seen, wanted, counts, weight = (p.to(self._place) for p in (seen, wanted, counts, weight))
+        answer = self.encoder(seen)
+        square = (weight[:, None, None] * (answer - wanted).square()).sum(1, keepdim=True)
         loss = (square * counts).sum() / counts.sum().clamp_min(1)
         self._taught += 1
         self._optimise(loss, done)
         # In the measure of the first part, so that the loop does not take the step for a leap.
         return float(loss.detach()) * max(self._level, 1e-6)
+
+    def _drawn(self) -> float:
+        return float(torch.rand((), generator=self._generators.torch))
 
     def _lesson(self, guide: Guide, aim: Tensor) -> tuple[Tensor, Tensor]:
         """What the encoder has to give for a guide, standardised, and 1 where it counts, else 0."""
@@ -319,9 +358,17 @@ class NeuBTF(Trainable):
     def _measured(self, window: Window) -> dict[str, float]:
         """Errors of the encoder's answer alone over a window, on held-out pairs."""
         material = self.material()
-        carried = self.carrier().carried(material, self._guidance, material.header)
+        carried = self.carrier().carried(
+            material, self._guidance, material.header, Asked(left_out=window)
+        )
+        self._copied = float(carried.header.provenance.get("copied", 0.0))
         order = np.random.default_rng([self._generators.seed, 0xCA2]).permutation(self._test)
         return errors_in(carried, self._btf, order[:_CARRIED_PAIRS], window)
+
+
+def turned(image: Tensor, turn: int) -> Tensor:
+    """(b, c, h, w) turned by `turn` mod 4 quarters, mirrored first from 4 on."""
+    return torch.rot90(image.flip(3) if turn >= 4 else image, turn % 4, (2, 3))
 
 
 def _part_of(material: NeuMIPMaterial) -> NeuMIPMaterial:

@@ -102,6 +102,15 @@ class Marching(Recipe[S]):
         self.queries += len(batch)
         return self.engine.take(batch, self.plan(progress, len(batch)))
 
+    def on_device(self, device: str) -> Trainable | None:
+        from btfkit.fitting.neumip.engines.device import OnDevice
+
+        self.engine = OnDevice(
+            self.layout, self.engine.state(), self._source, device,
+            loss=self.settings.loss, matrix=self.settings.matrix,  # type: ignore[arg-type]
+        )  # fmt: skip
+        return self
+
     def plan(self, progress: float, count: int) -> Step:
         """What the step at `progress` does with the gradient of `count` queries."""
         s = self.settings
@@ -142,15 +151,6 @@ class NeuMIP(Marching[Settings]):
 
     def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:
         return spec_of(self.settings, size, levels, len(self._header.channels))
-
-    def on_device(self, device: str) -> Trainable:
-        from btfkit.fitting.neumip.engines.device import OnDevice
-
-        self.engine = OnDevice(
-            self.layout, self.engine.state(), self._source, device,
-            loss=self.settings.loss, matrix=self.settings.matrix,  # type: ignore[arg-type]
-        )  # fmt: skip
-        return self
 
 
 def spec_of(s: Settings, size: tuple[int, int], levels: int, channels: int = 3) -> NeuMIPSpec:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from btfkit.btf import BTF
 from btfkit.errors import FitError
+from btfkit.fitting.loop import Trainable
 from btfkit.fitting.neumip.data import Source
 from btfkit.fitting.neumip.settings import INPUTS
 from btfkit.fitting.neumip.trainable import Marching
@@ -150,6 +151,14 @@ class SBTF(Marching[Settings]):
             self._heed_outlines(progress)
         return loss
 
+    def on_device(self, device: str) -> Trainable | None:
+        source = self._data
+        bend = None if isinstance(source, BTF) else source.curvature
+        # Rays that curvature bends, or that pass holes, are marched by the CPU alone.
+        if self.spec.holes or (bend is not None and bend.any()):
+            return None
+        return super().on_device(device)
+
     def untrained(self) -> tuple[str, ...]:
         source = self._data
         if not isinstance(source, BTF) and source.curvature is not None and source.curvature.any():
@@ -175,17 +184,22 @@ class SBTF(Marching[Settings]):
             return
         rows = np.flatnonzero(batch.curvature > 0)[:_OUTLINE_ROWS]
         _, texels = self.engine.parameters()
-        surface = self.layout.surface(texels)
-        found = Heights(surface, self.layout.depth_scale, curved=True)
+        found = Heights(self.layout.surface(texels), self.layout.depth_scale, curved=True)
         passes = np.asarray(np.isnan(batch.target[rows]).all(axis=1))
         if self._opacity is not None:
             # What passes through a hole says nothing of heights.
             solid = holes.solid_at(self._opacity, batch.uv[rows], wrap=self.layout.wrap)
             rows, passes = rows[solid], passes[solid]
-        surface += moved(
+        step = moved(
             found, batch.uv[rows], batch.view[rows], batch.curvature[rows], passes,
             aspect=self.layout.aspect, wrap=self.layout.wrap,
         )  # fmt: skip
+
+        def move(_: Array, texels: Array) -> None:
+            surface = self.layout.surface(texels)
+            surface += step
+
+        self.engine.change(move)
 
     def _look_for_thickness(self) -> None:
         """How far the sheet reaches down, from the heights as they are and the rays that pass."""
@@ -202,10 +216,13 @@ class SBTF(Marching[Settings]):
         )  # fmt: skip
 
     def _keep_given(self) -> None:
-        _, texels = self.engine.parameters()
-        surface = self.layout.surface(texels)
-        if self._given is not None:
-            surface[...] = self._given
-        if self._opacity is not None:
-            surface[...] = holes.with_holes(surface, self._opacity, self._thickness)
-            self.layout.cover(texels)[...] = self._opacity
+        def keep(_: Array, texels: Array) -> None:
+            surface = self.layout.surface(texels)
+            if self._given is not None:
+                surface[...] = self._given
+            if self._opacity is not None:
+                surface[...] = holes.with_holes(surface, self._opacity, self._thickness)
+                self.layout.cover(texels)[...] = self._opacity
+
+        if self._given is not None or self._opacity is not None:
+            self.engine.change(keep)

@@ -41,12 +41,17 @@ class NeuBTF(NeuMIPMaterial):
         mean = finest.astype(np.float32)
         kept["texture.0.0"] = finest
         for level, size in enumerate(level_sizes(spec.size, levels)[1:], start=1):
-            mean = _averaged(_averaged(mean, size[0], axis=0), size[1], axis=1)
+            mean = averaged(mean, size)
             kept[f"texture.0.{level}"] = mean.astype(finest.dtype)
         return NeuBTF(replace(spec, levels=levels), kept, header)
 
 
 AnyNeuBTF = NeuBTF | NeuBTFPaper
+
+
+def averaged(x: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """(*size, k) means of an image (h, w, k) over equal parts."""
+    return _averaged(_averaged(x, size[0], axis=0), size[1], axis=1)
 
 
 def _averaged(x: NDArray[np.float32], count: int, *, axis: int) -> NDArray[np.float32]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence, Sized
+from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, final
 
@@ -72,6 +72,10 @@ class Engine(ABC, Generic[B]):
     @abstractmethod
     def parameters(self) -> tuple[Array, Array]:
         """Weights and texels as they stand, in the CPU's memory."""
+
+    def change(self, edit: Callable[[Array, Array], None]) -> None:
+        """Have `edit` change weights and texels in place, wherever they are."""
+        edit(*self.parameters())
 
     @abstractmethod
     def state(self) -> dict[str, Array]:

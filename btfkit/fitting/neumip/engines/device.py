@@ -7,7 +7,7 @@ knows the layout. A state goes from here to the CPU's kernels and back.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import final
 
 import numpy as np
@@ -141,6 +141,12 @@ class OnDevice(Engine[DeviceBatch]):
     def parameters(self) -> tuple[Array, Array]:
         weights, texels = (self._tensors[name].cpu().numpy() for name in PARAMETERS)
         return weights, texels
+
+    def change(self, edit: Callable[[Array, Array], None]) -> None:
+        arrays = self.parameters()
+        edit(*arrays)
+        for name, array in zip(PARAMETERS, arrays, strict=True):
+            self._tensors[name].copy_(torch.from_numpy(array))
 
     def state(self) -> dict[str, Array]:
         return {name: tensor.to("cpu", copy=True).numpy() for name, tensor in self._tensors.items()}

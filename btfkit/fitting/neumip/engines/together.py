@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Mapping, Sequence, Sized
+from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import astuple, dataclass
 from typing import Any, final
 
@@ -66,6 +66,10 @@ class Together(Engine[Part]):
 
     def parameters(self) -> tuple[Array, Array]:
         return self._engine.parameters()
+
+    def change(self, edit: Callable[[Array, Array], None]) -> None:
+        self._engine.change(edit)
+        self.restore(self.state())
 
     def state(self) -> dict[str, Array]:
         return self._engine.state()
