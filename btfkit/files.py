@@ -12,19 +12,30 @@ from pathlib import Path
 
 # What must fit into a folder before anybody works for hours on what shall lie there.
 _LEAST_ROOM = 1 << 20
+# In a folder that was written whole: the files of it that --force may remove.
+_LIST = ".btfkit"
 
 
-def refuse_existing(path: str | os.PathLike[str], *, force: bool) -> Path:
+def refuse_existing(path: str | os.PathLike[str], *, force: bool, folder: bool = False) -> Path:
     """`path` as a Path, once it is sure that something can be written there.
 
+    Args:
+        path: final name. force: whether what has that name already is replaced.
+        folder: whether a folder is written; one that is empty may be there.
+
     Raises:
-        FileExistsError: it exists and `force` is False.
+        FileExistsError: it exists and `force` is False; or it is a folder with files that btfkit
+            did not write, which nothing replaces.
         FileNotFoundError: its folder is missing.
         OSError: nothing can be written into its folder, or the disk is full; names `path`.
     """
     final = Path(path)
-    if final.exists() and not force:
+    if final.is_dir() and not folder:
+        raise FileExistsError(f"{final} is a folder; name a file")
+    empty = final.is_dir() and not any(final.iterdir())
+    if final.exists() and not (force or empty):
         raise FileExistsError(f"{final} exists; --force (force=True) replaces it")
+    _refuse_foreign(final)
     if not final.parent.is_dir():
         raise FileNotFoundError(f"{final.parent} is not a folder; create it first")
     probe = final.with_name(f".{secrets.token_hex(8)}.probe")
@@ -36,6 +47,30 @@ def refuse_existing(path: str | os.PathLike[str], *, force: bool) -> Path:
         with suppress(OSError):
             probe.unlink(missing_ok=True)
     return final
+
+
+def _files(folder: Path) -> Iterator[str]:
+    for path in folder.rglob("*"):
+        if not path.is_dir() or path.is_symlink():
+            yield path.relative_to(folder).as_posix()
+
+
+def _refuse_foreign(final: Path) -> None:
+    """FileExistsError where a folder holds files that are not known to be btfkit's."""
+    if not final.is_dir():
+        return
+    group = final / "zarr.json"
+    if group.is_file() and b"btfkit" in group.read_bytes():
+        return
+    try:
+        ours = {_LIST, *(final / _LIST).read_text(encoding="utf-8").splitlines()}
+    except (OSError, UnicodeDecodeError):
+        ours = set()
+    if foreign := next((name for name in _files(final) if name not in ours), None):
+        raise FileExistsError(
+            f"{final} holds {foreign}, which btfkit did not write there: nothing replaces it; "
+            "name another folder"
+        )
 
 
 def room_for(path: Path, size: float, *, what: str) -> None:
@@ -83,11 +118,13 @@ def whole(path: str | os.PathLike[str], *, force: bool = False) -> Iterator[Path
 @contextmanager
 def whole_folder(path: str | os.PathLike[str], *, force: bool = False) -> Iterator[Path]:
     """A folder to fill beside `path`, renamed to it on success and removed on failure."""
-    final = refuse_existing(path, force=force)
+    final = refuse_existing(path, force=force, folder=True)
     partial = final.with_name(f".{final.name}.{secrets.token_hex(4)}.partial")
     partial.mkdir()
     try:
         yield partial
+        written = sorted(_files(partial))
+        (partial / _LIST).write_text("".join(f"{name}\n" for name in written), encoding="utf-8")
         replace_folder(partial, final)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -95,6 +132,7 @@ def whole_folder(path: str | os.PathLike[str], *, force: bool = False) -> Iterat
 
 def replace_folder(partial: Path, final: Path) -> None:
     """Give a finished folder its final name; what had that name before is removed after."""
+    _refuse_foreign(final)
     old = final.with_name(f".{final.name}.{secrets.token_hex(4)}.old")
     if final.exists():
         final.rename(old)

@@ -104,6 +104,10 @@ def ingest(
         FileExistsError: `out` exists and `force` is False.
     """
     final = located(out) if out is not None else store_name(source)
+    where = located(source)
+    own = isinstance(final, Path) and isinstance(where, Path) and final.exists()
+    if own and where.exists() and final.samefile(where):
+        raise ValueError(f"{final} is the source itself; name another store to write")
     # Before anything is read; the writer looks again.
     place_of(final, force=force)
     record = recorded(source, format=format, options=options, part=part, phase=phase)

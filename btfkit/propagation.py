@@ -78,8 +78,11 @@ def propagate(
         ValueError: a guidance with no size, too large, or with channels that no image has; normals
             or a mask of another size; a mask whose values are not one a model.
     """
-    final = None if out is None else refuse_existing(out, force=force)
     models = [model] if isinstance(model, (str, os.PathLike)) else list(model)
+    for path in models:
+        if out is not None and os.path.exists(out) and os.path.samefile(out, path):
+            raise ValueError(f"{path} is the model itself; name another file to write")
+    final = None if out is None else refuse_existing(out, force=force)
     fitted = [_fitted(path) for path in models]
     image, name = read_guidance(guidance)
     beside = read_beside(

@@ -25,7 +25,7 @@ def export_verb(bar: Bar, *, model: Path, target: str, out: Path, force: bool) -
     from btfkit.files import refuse_existing
     from btfkit.materials.file import load
 
-    refuse_existing(out, force=force)
+    refuse_existing(out, force=force, folder=True)
     made = export(load(model), target, out, force=force)
     listing = "\n".join(f"  {size:>10,}  {name}" for name, size in made["files"].items())
     return Outcome(

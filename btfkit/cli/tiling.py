@@ -47,8 +47,9 @@ def tile_file(
         kind = sources.kind_of(path)
     except FormatError:
         kind = None
-    final = refuse_existing(out if out is not None else tile_name(path), force=force)
-    if kind == "btf" and reader.detect(path):
+    store = kind == "btf" and reader.detect(path)
+    final = refuse_existing(out if out is not None else tile_name(path), force=force, folder=store)
+    if store:
         return _tile_store(path, final, drift, force, progress), final
     if kind == "model":
         return _tile_model(path, final, force), final

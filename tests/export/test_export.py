@@ -358,7 +358,10 @@ def test_the_verb_writes_a_folder_and_replaces_none_unasked(
     (out / "mine").touch()
     assert run(btfkit, call) == 1
     assert "exists; --force" in capsys.readouterr().err
+    assert run(btfkit, [*call, "--force"]) == 1
+    assert "holds mine, which btfkit did not write" in capsys.readouterr().err
     assert (out / "mine").exists()
+    (out / "mine").unlink()
     assert run(btfkit, [*call, "--force"]) == 0
     assert not (out / "mine").exists()
 

@@ -1,0 +1,83 @@
+"""What may be replaced: files and folders that btfkit wrote, and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import sources
+
+import btfkit
+from btfkit.cli import btfkit as command
+from btfkit.cli.outcome import run
+from btfkit.files import refuse_existing, replace_folder, whole_folder
+from btfkit.ingest import ingest
+from btfkit.materials import file
+from btfkit.materials.base import Header
+from btfkit.materials.lambert import Lambert, LambertSpec
+
+
+def _folder(path: Path, *names: str) -> Path:
+    with whole_folder(path, force=True) as folder:
+        for name in names:
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_text(name)
+    return path
+
+
+def test_a_folder_of_ours_is_replaced_only_when_asked(tmp_path: Path) -> None:
+    path = _folder(tmp_path / "a", "one", "deep/two")
+    with pytest.raises(FileExistsError, match="--force"):
+        refuse_existing(path, force=False, folder=True)
+    _folder(path, "three")
+    assert sorted(p.name for p in path.iterdir()) == [".btfkit", "three"]
+
+
+def test_what_others_put_into_a_folder_is_never_removed(tmp_path: Path) -> None:
+    path = _folder(tmp_path / "a", "one")
+    (path / "deep").mkdir()
+    (path / "deep" / "thesis.txt").write_text("years")
+    with pytest.raises(
+        FileExistsError, match=r"holds deep/thesis\.txt, which btfkit did not write"
+    ):
+        _folder(path, "three")
+    with pytest.raises(FileExistsError, match="thesis"):
+        replace_folder(tmp_path, path)
+    assert (path / "deep" / "thesis.txt").read_text() == "years"
+    assert (path / "one").is_file()
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_an_empty_folder_is_filled_and_a_folder_is_no_file(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    with whole_folder(tmp_path / "a") as folder:
+        (folder / "one").write_text("one")
+    assert (tmp_path / "a" / "one").is_file()
+    for force in (False, True):
+        with pytest.raises(FileExistsError, match="is a folder; name a file"):
+            refuse_existing(tmp_path / "a", force=force)
+
+
+@pytest.mark.parametrize("verb", ["ingest", "export", "synth"])
+def test_no_verb_replaces_a_folder_of_photographs(verb: str, tmp_path: Path) -> None:
+    photos = sources.SOURCES["lp"](tmp_path)
+    folder = photos if photos.is_dir() else photos.parent
+    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    model = tmp_path.parent / f"{tmp_path.name}.safetensors"
+    albedo = sources.small_btf().texture(0)
+    size = albedo.shape[:2]
+    file.save(Lambert(LambertSpec(size), {"texture": albedo}, Header(size)), model)
+    arguments = {
+        "ingest": [str(photos)],
+        "export": [str(model), "--to", "npz"],
+        "synth": ["print", "--as", "ubo2003", "--size", "8", "--views", "2", "--lights", "2"],
+    }[verb]
+    assert run(command, [verb, *arguments, "-o", str(folder), "--force"]) == 1
+    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
+
+
+def test_a_store_is_not_written_over_itself(tmp_path: Path) -> None:
+    store = ingest(sources.SOURCES["manifest"](tmp_path), tmp_path / "a.btf.zarr")
+    with pytest.raises(ValueError, match="is the source itself"):
+        ingest(store, store, force=True)
+    assert btfkit.open(store).texture(0).shape
