@@ -333,7 +333,10 @@ def save_state(
     tensors |= {f"best.{name}": value for name, value in (best or {}).items()}
     if generators.asked():
         tensors["torch_generator"] = generators.torch.get_state()
-    arrays = {name: np.array(value, order="C") for name, value in tensors.items()}
+    arrays = {
+        name: np.array(value if isinstance(value, np.ndarray) else value.numpy(), order="C")
+        for name, value in tensors.items()
+    }
     with whole(path, force=True) as partial:
         save_file(arrays, partial, {"btfkit_state": json.dumps(record)})
 

@@ -355,6 +355,13 @@ def test_every_level_of_a_smaller_texture_is_trained():
         assert all(texture[..., :7].any(axis=-1).all() for texture in levels)
 
 
+def test_three_features_begin_from_a_guess_that_has_no_room_for_colours():
+    model = trainable.NeuMIP(bumps(20), np.arange(20), np.arange(0), generators=loop.Generators(0),
+                             settings={"features": "3", "frames": "1"})  # fmt: skip
+    assert model.begun
+    assert np.isfinite(model.step(0.0))
+
+
 def rows(count=4000, *, footprint=True, seed=0):
     rng = np.random.default_rng(seed)
     uv, light, view = rng.random((count, 2), np.float32), upper(rng, count), upper(rng, count)

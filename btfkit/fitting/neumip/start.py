@@ -67,4 +67,5 @@ def begin_from(guess: Guess, layout: Layout, texels: Array) -> None:
         if size[0] < normal.shape[0] or size[1] < normal.shape[1]:
             normal = averaged(normal, size)
         texture[..., :3] = _NORMALS * enlarged(normal, size)
-        texture[..., 3 : 3 + count] = averaged(colours[..., :count], size)
+        if count:
+            texture[..., 3 : 3 + count] = averaged(colours[..., :count], size)
