@@ -146,7 +146,8 @@ def errors_carried(
         model: a NeuBTF file with its encoder. btf: data of the same kind of sample.
         pairs: that are compared; None takes all.
         window: top, left, height and width of the texels that are, of the sample that was fitted:
-            from there nothing is copied. None takes all, of another sample.
+            from there nothing is copied. None takes all, of another sample; if it is the same one
+            after all, nothing is copied.
 
     Returns:
         `psnr_carried`, `psnr_log1p_carried`, and `copied`, the share that was copied from the
@@ -158,7 +159,7 @@ def errors_carried(
     rest = every if pairs is None or len(pairs) == len(btf) else np.setdiff1d(every, pairs)
     frontal = augment.three_channels(frontal_slice(btf, rest))
     own = None if window is None else Window(*window)
-    carried = onto(augment.encoded(frontal)[None], Header.of(btf), Asked(left_out=own))
+    carried = onto(augment.encoded(frontal)[None], Header.of(btf), Asked(left_out=own, judged=True))
     _, h, w, _ = btf.shape
     found = errors_in(carried, btf, chosen, own or Window(0, 0, h, w))
     if found and "copied" in carried.header.provenance:

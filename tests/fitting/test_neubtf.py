@@ -210,7 +210,8 @@ def test_a_corrupted_encoder_shows_in_an_evaluation(
         for path in (untied, tmp_path / "bad.safetensors")
     )
     assert good["psnr_carried"] > bad["psnr_carried"] + 1
-    assert {"psnr_carried", "psnr_log1p_carried"} <= set(good)
+    # Onto itself nothing is copied: that would hide the encoder.
+    assert set(good) == {"psnr_carried", "psnr_log1p_carried"}
     # The same quarter as in the report, from which nothing is copied, either.
     window = json.loads(untied.with_name("untied.neubtf.report.json").read_text())["carried_window"]
     good, bad = (
@@ -260,10 +261,12 @@ def test_equal_seed_and_steps_give_equal_bytes_and_resume_goes_the_same_way(
         np.testing.assert_array_equal(array, (btfkit.load(part).weights | theirs)[name])
 
 
-@pytest.mark.parametrize(("model", "settings"), [("neubtf", TINY), ("sbtf", {"batch": "1024"})])
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["neubtf", "sbtf"])
 def test_on_a_device_the_same_is_trained_wherever_what_is_read_is_a_copy(
-    model: str, settings: dict[str, str], tiny: BTF, monkeypatch: pytest.MonkeyPatch
+    model: str, tiny: BTF, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    settings = TINY | {"guessed": "0"}
     # A GPU that is the CPU under another name, whose parameters are not the CPU's.
     for module in (training, fit):
         monkeypatch.setattr(module, "gpu", lambda: "cpu:0")
@@ -423,13 +426,8 @@ def test_files_hold_what_is_copied_from_and_propagation_says_how_much(
     for name, array in arrays.items():
         np.testing.assert_array_equal(again[name], array)
     picture = guidance_of(tiny)[0].permute(1, 2, 0).numpy() ** 2.2
-    alike, strange = (
-        propagation.propagate(image, untied, wrap="wrap")
-        for image in (picture, np.random.default_rng(0).random((32, 32, 3)).astype(np.float32))
-    )
-    shares = [m.header.provenance.get("copied", 0.0) for m in (alike, strange)]
-    # Noise shows nothing of the sample.
-    assert shares[0] > shares[1]
+    carried = propagation.propagate(picture, untied, wrap="wrap")
+    assert 0 < carried.header.provenance["copied"] <= 1
     without = {name: a for name, a in arrays.items() if not name.startswith("copying.")}
     file.save(btfkit.load(untied), tmp_path / "encoder.safetensors", training=without)
     alone = propagation.propagate(picture, tmp_path / "encoder.safetensors", wrap="wrap")

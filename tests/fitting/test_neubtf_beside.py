@@ -96,6 +96,7 @@ def test_a_picture_that_is_no_normal_map_is_refused(image: np.ndarray, message: 
         slopes_of(image)
 
 
+@pytest.mark.slow
 def test_a_photograph_given_as_normals_is_refused_by_name(fitted: Path, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "photo.png"), np.full((24, 32, 3), 250, np.uint8))
     with pytest.raises(FormatError, match=r"photo\.png: no normal map: vectors of mean length"):
@@ -104,6 +105,7 @@ def test_a_photograph_given_as_normals_is_refused_by_name(fitted: Path, tmp_path
         propagation.propagate(PICTURE, fitted, normals=tmp_path / "none.png")
 
 
+@pytest.mark.slow
 def test_heights_follow_the_normals_of_the_guidance(fitted: Path) -> None:
     wanted = bumps(24, 32)
     normals = normal_of(slopes(wanted))
@@ -126,8 +128,7 @@ def test_heights_follow_the_normals_of_the_guidance(fitted: Path) -> None:
 
 
 # --- masks ----------------------------------------------------------------------------------------
-
-
+@pytest.mark.slow
 def test_each_material_answers_where_the_mask_has_it(
     fitted: Path, black: Path, tmp_path: Path
 ) -> None:
@@ -155,6 +156,7 @@ def test_each_material_answers_where_the_mask_has_it(
     np.testing.assert_allclose(far, whole * (1 - inside.mean()), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_both_stand_on_one_relief_and_the_label_is_that_of_where_a_ray_ends(
     fitted: Path, black: Path
 ) -> None:
@@ -184,6 +186,7 @@ def test_both_stand_on_one_relief_and_the_label_is_that_of_where_a_ray_ends(
     assert ((entered != dark) & (away > 0.6)).sum() > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mask", "count", "message"),
     [
@@ -201,6 +204,7 @@ def test_masks_that_say_no_material_for_each_value_are_refused(
         propagation.propagate(PICTURE, [fitted] * count, mask=mask)
 
 
+@pytest.mark.slow
 def test_a_composite_has_no_program_and_its_parts_are_checked(fitted: Path, black: Path) -> None:
     both = propagation.propagate(PICTURE, [fitted, black], mask=MASK)
     assert isinstance(both, Composite)
@@ -215,6 +219,7 @@ def test_a_composite_has_no_program_and_its_parts_are_checked(fitted: Path, blac
         Composite.of(both.parts, MASK.astype(int) // 255, grey)
 
 
+@pytest.mark.slow
 def test_the_verb_takes_normals_and_a_mask(
     fitted: Path, black: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -241,7 +246,7 @@ def test_the_verb_takes_normals_and_a_mask(
     assert "has 2 values for 1 models" in capsys.readouterr().err
 
 
-def test_a_published_model_knows_no_normals(fitted: Path) -> None:
+def test_a_published_model_knows_no_normals() -> None:
     from btfkit.fitting.neubtf.carrier import Asked, PaperCarrier
 
     carrier = PaperCarrier(None, None, None)  # type: ignore[arg-type]

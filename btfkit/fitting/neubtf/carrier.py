@@ -30,6 +30,8 @@ _TIED = 0.3
 # Weight of the encoder's heights beside that of slopes: what they are off by is wide, and lies
 # between stones more than in them.
 _BY_ENCODER = 0.01
+# Mean difference of sRGB encoded guidance below which two are of one sample.
+_ALIKE = 0.02
 # Channels of the guidance, and whether it is the mean of many lights.
 INPUTS = 4
 
@@ -42,11 +44,14 @@ class Asked:
     Attributes:
         averaged: whether the guidance is a mean over many lights.
         left_out: what of the sample must not be copied.
+        judged: whether errors are told by it: then a sample is not copied onto itself, which would
+            hide an encoder that fails.
         slope: (h, w, 2) dz/dx and dz/dy that heights follow, y up, NaN where unknown.
     """
 
     averaged: bool = True
     left_out: Window | None = None
+    judged: bool = False
     slope: Array | None = None
 
 
@@ -159,6 +164,13 @@ class Carrier:
         among = augment.resized(shown, size, wrap=wrap)[0, 0] > 0.5
         return Mix.measured(answer[0], copied, wanted, among, scale)
 
+    def _is_own(self, guidance: Tensor) -> bool:
+        """Whether a guidance is the sample's, up to what other held-out pairs make of its mean."""
+        own = self.guidance
+        if own is None or own.shape != guidance.shape:
+            return False
+        return float((own - guidance).abs().mean()) < _ALIKE
+
     def scaled(self, answer: Tensor) -> Tensor:
         """An answer (b, k, h, w) as it is compared."""
         return answer if self.mix is None else answer * self.mix.scale[:, None, None]
@@ -198,9 +210,10 @@ class Carrier:
             header: of the new material; its grid is the guidance's size.
         """
         wrap = header.wrap == "wrap"
+        itself = asked.judged and asked.left_out is None and self._is_own(guidance)
         heights, features, copied = self.textures(
             guidance, wrap=wrap, averaged=asked.averaged,
-            copier=self.copier(material, asked.left_out),
+            copier=None if itself else self.copier(material, asked.left_out),
         )  # fmt: skip
         if asked.slope is not None:
             known = np.full(heights.shape, _BY_ENCODER)

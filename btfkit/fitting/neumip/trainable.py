@@ -102,12 +102,13 @@ class Marching(Recipe[S]):
         self.queries += len(batch)
         return self.engine.take(batch, self.plan(progress, len(batch)))
 
-    def on_device(self, device: str) -> Trainable | None:
+    def _moved_to(self, device: str, matrix: str = "bf16") -> Trainable:
+        """The same model on a torch device. matrix: as in `OnDevice`."""
         from btfkit.fitting.neumip.engines.device import OnDevice
 
         self.engine = OnDevice(
             self.layout, self.engine.state(), self._source, device,
-            loss=self.settings.loss, matrix=self.settings.matrix,  # type: ignore[arg-type]
+            loss=self.settings.loss, matrix=matrix,  # type: ignore[arg-type]
         )  # fmt: skip
         return self
 
@@ -151,6 +152,9 @@ class NeuMIP(Marching[Settings]):
 
     def _spec(self, size: tuple[int, int], levels: int) -> NeuMIPSpec:
         return spec_of(self.settings, size, levels, len(self._header.channels))
+
+    def on_device(self, device: str) -> Trainable:
+        return self._moved_to(device, self.settings.matrix)
 
 
 def spec_of(s: Settings, size: tuple[int, int], levels: int, channels: int = 3) -> NeuMIPSpec:

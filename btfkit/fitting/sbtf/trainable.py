@@ -157,7 +157,7 @@ class SBTF(Marching[Settings]):
         # Rays that curvature bends, or that pass holes, are marched by the CPU alone.
         if self.spec.holes or (bend is not None and bend.any()):
             return None
-        return super().on_device(device)
+        return self._moved_to(device)
 
     def untrained(self) -> tuple[str, ...]:
         source = self._data
