@@ -18,7 +18,7 @@ import numpy as np
 from btfkit.fitting.heightfield import find_relief
 from btfkit.fitting.heightfield.accuracy import against_truth, rerendered
 from btfkit.relief import procedural, synth
-from btfkit.relief.stack import read_stack
+from btfkit.relief.stack import chosen
 
 
 def measure(
@@ -27,8 +27,7 @@ def measure(
     """One material at one size: what the report states, and errors against the truth."""
     truth = procedural.make(name, size, relief_texels=relief_texels)
     lazy = synth.relief_btf(truth)
-    pairs = np.sort(read_stack(lazy).pairs)
-    btf = lazy.subset(pairs)
+    btf = lazy.subset(np.sort(chosen(lazy)))
     btf = replace(btf, textures=btf.batch(np.arange(len(btf))))
     cpu, start = time.process_time(), time.perf_counter()
     found = find_relief(btf, budget_s=budget_s, holdout=0.0)
@@ -53,7 +52,9 @@ def main() -> None:
             rows.append(measure(name, size, given.relief, given.budget))
             print(json.dumps(rows[-1], default=str), flush=True)
     print("| material | size | range | CPU s | normals, degrees", end=" | ")
-    print("model | normals | parallax | fusion | fusion, half | filtered, half |")
+    print(
+        "model | normals | parallax | fusion | fusion, half | filtered, half | by tenths of depth |"
+    )
     for row in rows:
         heights: dict[str, dict[str, float]] = row["heights"]  # type: ignore[assignment]
         cells = [f"{heights[k]['rms']:.3f}" if k in heights else "-"
@@ -63,7 +64,9 @@ def main() -> None:
             f"| {row['material']} | {row['size']} | {row['range_texels']:.1f} | {row['cpu_s']:.0f} "
             f"| {row['normal_median_deg']:.2f} / {row['normal_mean_deg']:.2f} | "
             + " | ".join(cells)
-            + f" | {last['rms_half']:.3f} | {last['rms_filtered_half']:.3f} |"
+            + f" | {last['rms_half']:.3f} | {last['rms_filtered_half']:.3f} | "
+            + " ".join(f"{part:.2f}" for part in row["by_depth"])
+            + " |"  # type: ignore[attr-defined]
         )
 
 

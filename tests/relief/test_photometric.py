@@ -183,3 +183,10 @@ def test_many_values_lie_on_disk_and_give_the_same(monkeypatch: pytest.MonkeyPat
     np.testing.assert_array_equal(
         photometric_stereo(outside).slope, photometric_stereo(inside).slope
     )
+
+
+def test_every_texel_of_a_relief_is_seen_from_straight_above() -> None:
+    """Folds of seams run through texel centres, the corners of the surface's cells."""
+    relief = procedural.make("cobbles", SIDE, relief_texels=3)
+    seen = visibility(relief.height * SIDE, np.float32([[0, 0, 1]]), wrap=True)
+    assert seen.all()

@@ -42,7 +42,7 @@ _MOST_HELD = 12
 # Standard deviation of heights of a flat sample, texels.
 _FLAT_HEIGHT = 0.1
 # Errors of heights by what views disagree: fitted to three traced materials, docs/heightfields.md.
-_LEAST_ERROR, _BY_DISAGREEMENT = 0.05, 5.0
+_LEAST_ERROR, _BY_DISAGREEMENT = 0.03, 10.0
 
 
 @final
@@ -305,7 +305,9 @@ def _round(
     swept = sweep(many, height, normals, step=step)
     bounds = shadow_bounds(few, height, normals) if bounded else None
     fused = fuse(
-        normals.slope, normals.variance[..., [0, 2]], swept.height, swept.variance,
+        normals.slope, normals.variance[..., [0, 2]], swept.height,
+        # What views disagree about, seams above all, must not lift what they agree on.
+        swept.variance + np.square(_BY_DISAGREEMENT * swept.disagreement),
         wrap=few.wrap, bounds=bounds, seed=seed,
     )  # fmt: skip
     return normals, swept, fused, bounds
