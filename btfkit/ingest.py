@@ -105,8 +105,8 @@ def ingest(
     """
     final = located(out) if out is not None else store_name(source)
     where = located(source)
-    own = isinstance(final, Path) and isinstance(where, Path) and final.exists()
-    if own and where.exists() and final.samefile(where):
+    here = isinstance(final, Path) and isinstance(where, Path)
+    if here and final.exists() and where.exists() and os.path.samefile(str(final), str(where)):
         raise ValueError(f"{final} is the source itself; name another store to write")
     # Before anything is read; the writer looks again.
     place_of(final, force=force)

@@ -75,10 +75,11 @@ def read_beside(
         raise ValueError(f"{len(models)} models and no mask that says where which is")
     slope, labels, told = None, None, {}
     if normals is not None:
-        given = isinstance(normals, np.ndarray)
-        slope = slopes_of(normals, y=green) if given else read_slopes(normals, y=green)
+        if isinstance(normals, np.ndarray):
+            slope, told["normals"] = slopes_of(normals, y=green), "an array"
+        else:
+            slope, told["normals"] = read_slopes(normals, y=green), os.fspath(normals)
         _check_size("normals", slope.shape, size)
-        told["normals"] = "an array" if given else os.fspath(normals)
     if mask is not None:
         labels = _labels(mask, models)
         _check_size("mask", labels.shape, size)

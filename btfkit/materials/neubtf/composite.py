@@ -145,4 +145,5 @@ def _spec_of(described: Mapping[str, Any]) -> NeuMIPSpec:
     known = {field.name for field in fields(NeuMIPSpec)}
     if unknown := described.keys() - known:
         raise ValueError(f"a material with {', '.join(sorted(unknown))}")
-    return NeuMIPSpec(**{n: tuple(v) if isinstance(v, list) else v for n, v in described.items()})
+    told: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in described.items()}
+    return NeuMIPSpec(**told)
