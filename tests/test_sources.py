@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sources import small_btf
 
-from btfkit import sources
+from btfkit import io, sources
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
 from btfkit.fitting.fit import fit
@@ -73,3 +73,14 @@ def test_what_does_not_serve_is_refused_by_what_it_is(folder: Path) -> None:
         sources.kind_of(folder / "note.txt")
     with pytest.raises(FileNotFoundError, match="no such file or folder"):
         sources.kind_of(folder / "missing")
+
+
+def test_a_folder_that_no_reader_knows_says_what_it_is(tmp_path):
+    with pytest.raises(FormatError, match="the folder is empty"):
+        io.detect(tmp_path)
+    for name in ("journal.jsonl", "plan.json"):
+        (tmp_path / name).touch()
+    with pytest.raises(
+        FormatError, match="a run of captures that has not ended; btfkit capture --"
+    ):
+        io.detect(tmp_path)

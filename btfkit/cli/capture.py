@@ -82,6 +82,8 @@ def capture_verb(
     from btfkit.devices.capture.store import PLAN
 
     if plan_name is None and resume and out is not None:
+        if not (out / PLAN).is_file():
+            raise FileNotFoundError(f"{out}: no run to resume; leave out --resume to begin one")
         plan_name = str(out / PLAN)
     if plan_name is None:
         raise click.UsageError("Missing option '--plan'.")

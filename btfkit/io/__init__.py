@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import shlex
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -65,8 +66,13 @@ def detect(path: str | os.PathLike[str] | Remote) -> str:
     for name in FORMATS:
         if format_module(name).detect(source):
             return name
+    if source.is_dir() and not any(source.iterdir()):
+        raise FormatError(source, "the folder is empty")
+    if (source / "journal.jsonl").is_file() and (source / "plan.json").is_file():
+        again = f"btfkit capture --resume -o {shlex.quote(str(source))} goes on with it"
+        raise FormatError(source, "a run of captures that has not ended", remedy=again)
     what = f"no reader knows this {'folder' if source.is_dir() else 'file'}"
-    remedy = f"formats are {', '.join(FORMATS)}; name one with --format"
+    remedy = f"formats are {', '.join(FORMATS)}; btfkit ingest --format names one"
     photographs = _photographs(source)
     if photographs:
         what += f" of {photographs} pictures: nothing says where light and view were"

@@ -84,9 +84,11 @@ class _Ingest:
         self.source, self.out = _source(folder / "pictures"), folder / "a.btf.zarr"
 
     def job(self) -> int:
+        # A kill may come when all is done.
+        more = ["--force"] if self.out.exists() else []
         return run(
             command,
-            ["ingest", str(self.source), "-o", str(self.out), "--no-preview", "--jobs", "1"],
+            ["ingest", str(self.source), "-o", str(self.out), "--no-preview", "--jobs", "1", *more],
         )
 
     def held(self) -> bytes:
@@ -137,11 +139,8 @@ class _Capture:
 
         from btfkit.sequence import TABLE
 
-        begun = (
-            (self.out / "journal.jsonl").exists()
-            or (self.out / TABLE).exists()
-            or self.out.exists()
-        )
+        # Before its first exposure a run is begun anew, with the same command.
+        begun = (self.out / "twin.jsonl").exists() or (self.out / TABLE).exists()
         runs.run(self.out, resume=begun)
         return 0
 

@@ -463,3 +463,20 @@ def test_an_axis_takes_as_long_as_its_ramp_allows():
     axis = Axis("a", 0, 10, velocity=2, acceleration=4)
     assert axis.travel_s(3) == pytest.approx(3 / 2 + 2 / 4)
     assert axis.travel_s(-0.25) == pytest.approx(2 * math.sqrt(0.25 / 4))
+
+
+def test_what_ended_before_its_first_frame_is_begun_anew(tmp_path):
+    folder = tmp_path / "run"
+    begin(folder, SMALL, resume=False, storage=0)
+    (folder / "frames").mkdir()
+    (folder / "journal.jsonl").write_bytes(encoded({"record": "session", "number": 0}))
+    begin(folder, {**SMALL, "name": "other"}, resume=False, storage=0)
+    assert json.loads((folder / "plan.json").read_text())["name"] == "other"
+    assert not (folder / "journal.jsonl").exists()
+    (folder / "frames" / "1.png").write_bytes(b"")
+    with pytest.raises(FileExistsError, match="--resume goes on with the run in it, and nothing"):
+        begin(folder, SMALL, resume=False, storage=0)
+    (tmp_path / "else").mkdir()
+    (tmp_path / "else" / "thesis.txt").touch()
+    with pytest.raises(FileExistsError, match="name another folder"):
+        begin(tmp_path / "else", SMALL, resume=False, storage=0)

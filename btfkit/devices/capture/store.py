@@ -188,23 +188,37 @@ def begin(path: Path, document: Mapping[str, Any], *, resume: bool, storage: flo
         return
     refuse_begun(path)
     path.mkdir(parents=True, exist_ok=True)
+    (path / NAME).unlink(missing_ok=True)
     free = shutil.disk_usage(path).free
     if storage > free:
         raise DeviceError(
             f"the run takes up to {storage / 1e9:.1f} GB; {path} has {free / 1e9:.1f} GB left",
             remedy="free some space, or measure fewer pairs",
         )
-    documents.save(path / PLAN, document)
+    documents.save(path / PLAN, document, force=True)
 
 
 def refuse_begun(path: Path) -> None:
-    """Refuse a folder in which something is.
+    """Refuse a folder in which something is; what ended before its first frame is nothing.
 
     Raises:
-        FileExistsError: it is not empty.
+        FileExistsError: it holds a run, or something else.
     """
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise FileExistsError(f"{path} exists; --resume goes on with the run in it")
+    if not path.exists() or (path.is_dir() and _before_its_first_frame(path)):
+        return
+    if path.is_dir() and (path / PLAN).is_file():
+        said = "--resume goes on with the run in it, and nothing replaces one"
+    else:
+        said = "name another folder: nothing of it is replaced"
+    raise FileExistsError(f"{path} exists; {said}")
+
+
+def _before_its_first_frame(path: Path) -> bool:
+    found = {file.relative_to(path).as_posix() for file in path.rglob("*")}
+    if not found <= {PLAN, NAME, FRAMES}:
+        return False
+    journal = path / NAME
+    return not journal.exists() or b'"frame"' not in journal.read_bytes()
 
 
 def finished_groups(records: Sequence[Record]) -> dict[int, list[Record]]:
