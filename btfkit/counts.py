@@ -235,11 +235,13 @@ def _check_layout(name: str, data: bytes) -> None:
         pages = [*chain, *(each for d in chain for each in below(data, d))]
         if len(pages) != 1:
             raise _no_counts(name, f"holds {len(pages)} pictures")
-        fault = _fault_of(pages[0])
+        fault, strips = _fault_of(pages[0]), pages[0].fault_of_strips()
     except (struct.error, ValueError, KeyError) as error:
         raise FormatError(name, "not a readable image", remedy="copy it again") from error
     if fault:
         raise _no_counts(name, fault)
+    if strips:
+        raise FormatError(name, strips, remedy="copy it again")
 
 
 def _fault_of(picture: Directory) -> str | None:

@@ -9,6 +9,7 @@ import struct
 from typing import Any, final
 
 WIDTH, HEIGHT, SUBDIRECTORIES = 256, 257, 330
+STRIPS, SAMPLES, STRIP_ROWS, PLANAR = 273, 277, 278, 284
 _FORMS = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "s", 8: "h", 9: "i", 10: "ii",
           11: "f", 12: "d", 13: "I", 16: "Q", 17: "q", 18: "Q"}  # fmt: skip
 _MOST_DIRECTORIES, _MOST_ENTRIES, _MOST_VALUE = 4096, 4096, 1 << 24
@@ -73,8 +74,24 @@ class Directory:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(h, w)."""
-        return int(self.values(HEIGHT)[0]), int(self.values(WIDTH)[0])
+        """(h, w). Raises struct.error, ValueError or KeyError where it is damaged."""
+        sides = self.values(HEIGHT), self.values(WIDTH)
+        if not all(sides):
+            raise ValueError("no size")
+        return int(sides[0][0]), int(sides[1][0])
+
+    def fault_of_strips(self) -> str | None:
+        """What is wrong where there are other strips than the rows need; None for tiles, too."""
+        if STRIPS not in self:
+            return None
+        rows, _ = self.size
+        each = min(self.number(STRIP_ROWS, rows), rows)
+        planes = self.number(SAMPLES, 1) if self.number(PLANAR, 1) == 2 else 1
+        needed = planes * -(-rows // each) if each > 0 else 0
+        found = len(self.values(STRIPS))
+        if found == needed:
+            return None
+        return f"{found} strips of {each} rows for {rows} rows; expected {needed}"
 
 
 def chain_of(data: bytes) -> list[Directory]:

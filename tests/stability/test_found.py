@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import sources
+import tifffile
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
@@ -27,6 +28,7 @@ from btfkit.io import archive, detect, images, queryfile
 from btfkit.materials import file as model_file
 from btfkit.materials.base import Header
 from btfkit.materials.lambert import Lambert, LambertSpec
+from btfkit.tifftags import chain_of
 
 
 def _npy(header: str, body: bytes = b"") -> bytes:
@@ -188,3 +190,37 @@ def test_what_lies_in_a_source_is_refused_by_name(
     change(source)
     with pytest.raises(BtfkitError, match=message):
         btfkit.open(source).texture(0)
+
+
+def test_a_bmp_whose_pixels_lie_in_its_palette_is_refused() -> None:
+    grey = cv2.imencode(".bmp", np.full((3, 4), 90, np.uint8))[1].tobytes()
+    assert images.read("a.bmp", grey, transfer="linear").shape[:2] == (3, 4)
+    data = bytearray(grey)
+    data[10:14] = struct.pack("<I", 54)
+    with pytest.raises(FormatError, match=f"pixels at byte 54 of {len(data)}; expected 1078 or"):
+        images.read("a.bmp", bytes(data), transfer="linear")
+
+
+@pytest.mark.parametrize("options", [{}, {"rowsperstrip": 6}, {"planarconfig": "separate"}])
+def test_a_tiff_with_fewer_strips_than_rows_is_refused(options: dict[str, object]) -> None:
+    shape = options == {"planarconfig": "separate"}
+    pixels = np.full((3, 20, 4) if shape else (20, 4, 3), 90, np.uint8)
+    buffer = io.BytesIO()
+    tifffile.imwrite(buffer, pixels, photometric="rgb", metadata=None, **options)
+    data = bytearray(buffer.getvalue())
+    assert images.read("a.tif", bytes(data), transfer="linear").shape == (20, 4, 3)
+    (directory,) = chain_of(bytes(data))
+    taller = directory.patched(257, 72)
+    with pytest.raises(FormatError, match=r"strips of .* rows for 72 rows; expected"):
+        images.read("a.tif", taller, transfer="linear")
+
+
+def test_a_tiff_without_a_size_is_refused() -> None:
+    buffer = io.BytesIO()
+    tifffile.imwrite(buffer, np.full((20, 4, 3), 90, np.uint8), photometric="rgb", metadata=None)
+    data = bytearray(buffer.getvalue())
+    (directory,) = chain_of(bytes(data))
+    at = directory._at[257]
+    data[at + 4 : at + 8] = bytes(4)
+    with pytest.raises(FormatError, match=r"a\.tif"):
+        images.read("a.tif", bytes(data), transfer="linear")

@@ -12,13 +12,13 @@ from btfkit.io.images import icc
 from btfkit.io.images.header import Header
 from btfkit.io.images.profiles import SRGB, Declared
 
-_V4, _V5 = 108, 124
+_CORE, _V4, _V5 = 12, 108, 124
 _SRGB, _WINDOWS, _CALIBRATED, _EMBEDDED = b"BGRs", b" niW", b"\0\0\0\0", b"DEBM"
 
 
 def size(data: bytes) -> tuple[int, int]:
     """(h, w). Raises struct.error where it is cut."""
-    if struct.unpack_from("<I", data, 14)[0] == 12:
+    if struct.unpack_from("<I", data, 14)[0] == _CORE:
         w, h = struct.unpack_from("<HH", data, 18)
     else:
         w, h = struct.unpack_from("<ii", data, 18)
@@ -35,12 +35,22 @@ def describe(name: str, data: bytes) -> Header:
     """
     h, w = size(data)
     (pixels,), (length,) = struct.unpack_from("<I", data, 10), struct.unpack_from("<I", data, 14)
-    if not 14 + length <= pixels < len(data):
+    least = 14 + length + _palette_bytes(data, length)
+    if not least <= pixels < len(data):
         raise FormatError(
-            name, f"pixels at byte {pixels} of {len(data)}; expected {14 + length} or later",
+            name, f"pixels at byte {pixels} of {len(data)}; expected {least} or later",
             remedy="copy it again, or save it as PNG",
         )  # fmt: skip
     return Header(h, w, colours=3, bits=8, declared=_declared(name, data))
+
+
+def _palette_bytes(data: bytes, length: int) -> int:
+    """Size of the colours that pixels of 8 bits or fewer stand for."""
+    if length == _CORE:
+        (bits,) = struct.unpack_from("<H", data, 24)
+        return 3 << bits if bits <= 8 else 0
+    (bits,), (used,) = struct.unpack_from("<H", data, 28), struct.unpack_from("<I", data, 46)
+    return 4 * (used or 1 << bits) if bits <= 8 else 0
 
 
 def _declared(name: str, data: bytes) -> Declared | None:

@@ -58,6 +58,7 @@ def describe(name: str, data: bytes) -> Header:
         bits = 16
     colours, alpha, premultiplied = _channels(name, directory)
     _check_stack(name, directory, h * w * (colours + alpha))
+    _check_strips(name, directory)
     for tag, what in _NOT_READ.items():
         if tag in directory and _ICC not in directory:
             raise FormatError(name, f"declares {what}, which is not read", remedy="save it as PNG")
@@ -179,6 +180,12 @@ def _check_stack(name: str, directory: Directory, values: int) -> None:
         raise FormatError(
             name, f"holds a stack of {planes} pictures; expected one", remedy="save each by itself"
         )
+
+
+def _check_strips(name: str, directory: Directory) -> None:
+    """Refuse fewer strips than rows need: decoders leave the others as they please."""
+    if fault := directory.fault_of_strips():
+        raise FormatError(name, fault, remedy="copy it again")
 
 
 def _declared(name: str, directory: Directory, colours: int) -> Declared | None:
