@@ -181,10 +181,25 @@ def save(
         partial.write_text(format_table(frames, linear=linear), encoding="utf-8")
 
 
+# Parts of a section that are objects, and lists of them.
+_OBJECTS = {"rig": ("camera", "light", "carries"), "target": ("sample", "white", "board")}
+_LISTS = {"rig": ("axes",), "target": ("patches", "spheres")}
+
+
 def _section(folder: Path, document: Mapping[str, Any], name: str) -> dict[str, Any]:
     section = document.get(name, {})
     if not isinstance(section, dict):
         raise FormatError(folder / DOCUMENT, f"{name} is {str(section)[:40]}; expected an object")
+    for part, value in section.items():
+        if part in _LISTS.get(name, ()):
+            good = isinstance(value, list) and all(isinstance(each, dict) for each in value)
+            expected = "a list of objects"
+        else:
+            good = isinstance(value, dict) or part not in _OBJECTS.get(name, ())
+            expected = "an object"
+        if not good:
+            said = f"{name}.{part} is {str(value)[:40]}; expected {expected}"
+            raise FormatError(folder / DOCUMENT, said)
     return section
 
 

@@ -81,7 +81,8 @@ class Axis:
 
     def __post_init__(self) -> None:
         direction = np.asarray(self.direction, float)
-        length = float(np.linalg.norm(direction))
+        with np.errstate(over="ignore"):
+            length = float(np.linalg.norm(direction))
         if self.kind not in ("rotary", "linear"):
             raise CalibrationError(
                 f"axis {self.name!r} is {self.kind!r}; an axis is 'rotary' or 'linear'"

@@ -141,9 +141,11 @@ class _Axis:
     def of(entry: Mapping[str, Any]) -> _Axis:
         direction = np.asarray(entry["direction"], float)
         point = np.asarray(entry.get("point_mm", (0, 0, 0)), float)
-        if direction.shape != (3,) or point.shape != (3,) or not np.linalg.norm(direction) > 0:
+        with np.errstate(over="ignore"):
+            length = float(np.linalg.norm(direction))
+        if direction.shape != (3,) or point.shape != (3,) or not 0 < length < np.inf:
             raise ValueError(f"axis {entry['name']!r} has no direction")
-        unit = direction / np.linalg.norm(direction)
+        unit = direction / length
         return _Axis(str(entry["name"]), unit, point, entry.get("kind") == "linear")
 
     def moved(self, points: Floats, frame: Frame, *, back: bool = False) -> Floats:

@@ -120,7 +120,8 @@ def grid_of(
     sequence: Sequence, rig: CalibratedRig, groups: list[tuple[int, ...]], texel_mm: float | None
 ) -> Grid:
     """Texels over the sample's area."""
-    size = sequence.target.get("sample", {}).get("size_mm")
+    sample = sequence.target.get("sample")
+    size = sample.get("size_mm") if isinstance(sample, dict) else None
     numbers = isinstance(size, list) and all(isinstance(s, int | float) for s in size)
     if not numbers or len(size) != 2 or not all(0 < s < math.inf for s in size):
         raise CalibrationError(

@@ -263,6 +263,13 @@ class Archive:
             raise FormatError(
                 self.path, f"member {name!r} stands in the archive twice", remedy="pack it anew"
             )
+        held = self.path.stat().st_size
+        if info.header_offset + info.compress_size > held:
+            raise FormatError(
+                self.path,
+                f"member {name!r} says it takes {info.compress_size} of the file's {held} bytes",
+                remedy="copy it again",
+            )
         if info.file_size > max(1 << 20, min(_MOST_BYTES, _MOST_RATIO * info.compress_size)):
             raise FormatError(
                 self.path,

@@ -88,6 +88,9 @@ def _queries(path: Path, found: dict[str, NDArray[Any]]) -> QuerySet:
         return QuerySet(**arrays)
     except ValueError as error:
         raise FormatError(path, str(error)) from error
+    except SystemError as error:
+        # What numpy says of text that is no Unicode.
+        raise FormatError(path, f"holds text that cannot be read ({error})") from error
 
 
 def _channels(found: dict[str, NDArray[Any]], count: int) -> tuple[str, ...]:

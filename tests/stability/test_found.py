@@ -162,6 +162,20 @@ def _area(folder: Path) -> None:
     path.write_text(json.dumps(told))
 
 
+def _sample(folder: Path) -> None:
+    path = folder / "sequence.json"
+    told = json.loads(path.read_text())
+    told["target"]["sample"] = []
+    path.write_text(json.dumps(told))
+
+
+def _direction(folder: Path) -> None:
+    path = folder / "sequence.json"
+    told = json.loads(path.read_text())
+    told["rig"]["axes"][0]["direction"] = [0, 1e308, 1e308]
+    path.write_text(json.dumps(told))
+
+
 def _shard(folder: Path) -> None:
     path = folder / "texture" / "zarr.json"
     told = json.loads(path.read_text())
@@ -179,6 +193,8 @@ def _frame(folder: Path) -> None:
         ("materialgan", _lamp, "expected three powers above 0"),
         ("hsh", _coefficients, "its coefficients give values that are no numbers"),
         ("sequence", _area, "says no target.sample.size_mm"),
+        ("sequence", _sample, r"target\.sample is \[\]; expected an object"),
+        ("sequence", _direction, "has no direction"),
         ("zarr", _shard, "chunk|checksum|texture 0"),
         ("sequence", _frame, "cut short"),
     ],
@@ -224,3 +240,26 @@ def test_a_tiff_without_a_size_is_refused() -> None:
     data[at + 4 : at + 8] = bytes(4)
     with pytest.raises(FormatError, match=r"a\.tif"):
         images.read("a.tif", bytes(data), transfer="linear")
+
+
+def test_a_member_that_says_it_is_larger_than_its_archive_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.zip"
+    picture = cv2.imencode(".png", np.full((3, 4, 3), 90, np.uint8))[1].tobytes()
+    with zipfile.ZipFile(path, "w") as file:
+        for light in (10, 20):
+            file.writestr(f"tl{light:03d}_pl000_tv000_pv000.png", picture)
+    data = path.read_bytes()
+    at = data.rindex(b"PK\x01\x02")
+    sizes = struct.pack("<II", 1528902000, 2041545324)
+    path.write_bytes(data[: at + 20] + sizes + data[at + 28 :])
+    with pytest.raises(FormatError, match="says it takes 1528902000 of the file's"):
+        btfkit.open(path).texture(1)
+
+
+def test_text_of_a_query_file_that_is_no_unicode_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "q.npz"
+    up = np.tile(np.float32([0, 0, 1]), (2, 1))
+    text = np.frombuffer(b"\xff\xff\xff\x7f", "<U1").reshape(())
+    np.savez(path, uv=up[:, :2], light=up, view=up, provenance=text)
+    with pytest.raises(FormatError, match="holds text that cannot be read"):
+        queryfile.read(path)
