@@ -78,7 +78,7 @@ def test_a_dry_run_says_order_time_and_storage_and_writes_nothing(capsys, tmp_pa
         (["--device", "mock", "--plan", "demo", "-o", "x", "--fault", "fire"], 1, "fault 'fire'"),
         (["--device", "mock", "--plan", "none.json", "-o", "x"], 1, "no such plan"),
         (["--device", "usb", "--plan", "demo", "-o", "x"], 1, "no rig on the USB bus"),
-        (["--device", "mock", "-o", "x", "--resume"], 1, "no such plan"),
+        (["--device", "mock", "-o", "x", "--resume"], 1, "no run to resume"),
     ],
 )  # fmt: skip
 def test_wrong_wishes_are_refused_in_a_line(

@@ -472,7 +472,7 @@ def test_what_ended_before_its_first_frame_is_begun_anew(tmp_path):
     (folder / "journal.jsonl").write_bytes(encoded({"record": "session", "number": 0}))
     begin(folder, {**SMALL, "name": "other"}, resume=False, storage=0)
     assert json.loads((folder / "plan.json").read_text())["name"] == "other"
-    assert not (folder / "journal.jsonl").exists()
+    assert (folder / "journal.jsonl").read_bytes() == b""
     (folder / "frames" / "1.png").write_bytes(b"")
     with pytest.raises(FileExistsError, match="--resume goes on with the run in it, and nothing"):
         begin(folder, SMALL, resume=False, storage=0)

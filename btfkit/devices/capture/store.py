@@ -188,13 +188,14 @@ def begin(path: Path, document: Mapping[str, Any], *, resume: bool, storage: flo
         return
     refuse_begun(path)
     path.mkdir(parents=True, exist_ok=True)
-    (path / NAME).unlink(missing_ok=True)
     free = shutil.disk_usage(path).free
     if storage > free:
         raise DeviceError(
             f"the run takes up to {storage / 1e9:.1f} GB; {path} has {free / 1e9:.1f} GB left",
             remedy="free some space, or measure fewer pairs",
         )
+    # First, so that the plan beside it is known to be ours.
+    (path / NAME).write_bytes(b"")
     documents.save(path / PLAN, document, force=True)
 
 
@@ -215,10 +216,11 @@ def refuse_begun(path: Path) -> None:
 
 def _before_its_first_frame(path: Path) -> bool:
     found = {file.relative_to(path).as_posix() for file in path.rglob("*")}
-    if not found <= {PLAN, NAME, FRAMES}:
+    if not found:
+        return True
+    if not (NAME in found and found <= {PLAN, NAME, FRAMES}):
         return False
-    journal = path / NAME
-    return not journal.exists() or b'"frame"' not in journal.read_bytes()
+    return b'"frame"' not in (path / NAME).read_bytes()
 
 
 def finished_groups(records: Sequence[Record]) -> dict[int, list[Record]]:
