@@ -195,7 +195,9 @@ class BTF:
             table, index = directions.unique(direction)
             keep &= np.isin(index, np.arange(len(table))[chosen])
         if not keep.any():
-            raise ValueError(f"lights {lights} and views {views} leave none of {len(self)} pairs")
+            raise ValueError(
+                f"lights {_typed(lights)} and views {_typed(views)} leave none of {len(self)} pairs"
+            )
         return self.subset(keep)
 
     def crop(self, rows: slice, cols: slice) -> BTF:
@@ -207,7 +209,9 @@ class BTF:
         _, h, w, _ = self.shape
         r, c = (slice(*s.indices(size)[:2]) for s, size in ((rows, h), (cols, w)))
         if r.stop <= r.start or c.stop <= c.start or rows.step or cols.step:
-            raise ValueError(f"window rows {rows}, cols {cols} of a {h} x {w} texture is empty")
+            raise ValueError(
+                f"window rows {_typed(rows)}, cols {_typed(cols)} of a {h} x {w} texture is empty"
+            )
         if (r.start, r.stop, c.start, c.stop) == (0, h, 0, w):
             return self
         # Positions are from the centre of the sample; the window has a centre of its own.
@@ -275,3 +279,9 @@ class BTF:
         rows, cols = np.arange(h)[:, None], np.arange(w)
         x, y = nearfield.texel_places(rows, cols, (h, w), self._known_texel_mm())
         return nearfield.directions_at(near[index], x, y).astype(np.float32)
+
+
+def _typed(part: slice) -> str:
+    """A slice as one types it: 2:5."""
+    ends = ["" if end is None else str(end) for end in (part.start, part.stop, part.step)]
+    return ":".join(ends if part.step is not None else ends[:2])
