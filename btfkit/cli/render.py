@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -187,6 +188,8 @@ def _still(
     )  # fmt: skip
     if seen.interrupted:
         raise KeyboardInterrupt
+    if not seen.asked:
+        warnings.warn("no light reaches what is seen: the picture is black", stacklevel=2)
     seconds = time.perf_counter() - start
     return Outcome(
         f"{final}: {w} x {h}, {seen.samples} rays a pixel, {seen.asked} queries, {seconds:.1f} s"

@@ -281,3 +281,13 @@ def test_an_interruption_that_a_library_wrapped_is_one(monkeypatch: pytest.Monke
 
     monkeypatch.setattr("btfkit.open", wrapped, raising=False)
     assert call("convert", "a", "-o", "b", "--as", "utia") == 130
+
+
+def test_a_light_behind_the_sample_is_a_black_picture_and_said_to_be_one(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ("render", store, "--size", "8x8", "-o", tmp_path / "a.png", "--force")
+    assert call(*asked, "--light", "95,0") == 0
+    assert "no light reaches what is seen: the picture is black" in capsys.readouterr().err
+    assert call(*asked, "--light", "20,0") == 0
+    assert "black" not in capsys.readouterr().err
