@@ -153,6 +153,9 @@ def header_of(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _opened(path: str | os.PathLike[str]) -> Any:
+    if Path(path).is_dir():
+        remedy = "btfkit fit makes a material of a store"
+        raise FormatError(path, "a folder; expected a material's file", remedy=remedy)
     if not Path(path).is_file():
         raise FileNotFoundError(f"{os.fspath(path)}: no such file")
     try:
