@@ -79,4 +79,6 @@ def files_of(source: Path) -> list[Path]:
     """All files of a source, sorted."""
     if source.is_file():
         return [source]
-    return sorted(path for path in source.rglob("*") if path.is_file())
+    # Readers leave alone the list that says what --force may remove.
+    found = (path for path in source.rglob("*") if path.is_file())
+    return sorted(path for path in found if path.name != ".btfkit")

@@ -274,6 +274,7 @@ def test_a_writer_leaves_nothing_when_it_is_interrupted_and_replaces_only_by_for
 
 
 def test_what_no_reader_knows_is_told_with_the_list_of_formats(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("?")
     with pytest.raises(FormatError, match=r"no reader knows this folder; formats are zarr, .*lp"):
         io.detect(tmp_path)
     (tmp_path / "a.txt").write_text("hello")
