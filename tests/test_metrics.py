@@ -134,6 +134,7 @@ def test_group_16_nothing_measured_is_an_error_not_a_mean_of_nothing() -> None:
         found.errors()
 
 
+@pytest.mark.slow
 @given(st.integers(1, 5), st.floats(0.001, 0.3))
 def test_pooling_in_parts_is_pooling_at_once(parts: int, amount: float) -> None:
     truth = picture()

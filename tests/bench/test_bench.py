@@ -218,6 +218,7 @@ def test_one_rainer20_is_trained_on_all_materials_and_answers_for_each(tmp_path)
     assert len(found) == 6
 
 
+@pytest.mark.slow
 def test_shared_networks_fit_the_material_they_are_asked_for():
     """Trained on two materials at once, the answer for each is nearer to it than to the other."""
     from btfkit.materials.evaluation import errors_on_btf
@@ -232,6 +233,7 @@ def test_shared_networks_fit_the_material_they_are_asked_for():
         assert mse[0] < 0.5 * mse[1]
 
 
+@pytest.mark.slow
 def test_query_files_are_benchmarked_by_what_can_be_fitted_to_them(tmp_path):
     case = procedural("print", size=16, directions=3, seed=0)
     queryfile.write(case.queries, tmp_path / "q.npz")
@@ -388,6 +390,7 @@ def test_smaller_textures_change_little():
     assert table[2]["mae"] < 1e-2
 
 
+@pytest.mark.slow
 def test_answers_from_elsewhere_are_scored_as_a_models_own(tmp_path, capsys):
     """What lambert answers to the questions gets the errors of lambert's own cell."""
     store = tmp_path / "cloth.btf.zarr"

@@ -18,6 +18,8 @@ from btfkit.calibration.spheres import Optics, find_spheres
 from btfkit.colour import to_srgb
 from btfkit.errors import CalibrationError
 
+pytestmark = pytest.mark.slow
+
 THREE = (((-45, 25), 12.5), ((40, -22), 12.5), ((35, 28), 10.0))
 FAR = Scene(THREE, width=480, height=320)
 NEAR = Scene(THREE, width=480, height=320, camera_mm=800.0)

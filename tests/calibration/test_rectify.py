@@ -77,6 +77,7 @@ def gaussian(frame, place, slope, threads=None):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("tilt_deg", "least_db"), [(0, 33), (45, 26), (60, 18)])
 def test_a_fabric_keeps_its_texture_at_any_tilt_where_bilinear_samples_lose_it(
     cloth, tilt_deg, least_db

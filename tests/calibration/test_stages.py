@@ -30,6 +30,8 @@ from btfkit.colour import to_srgb
 from btfkit.errors import CalibrationError, FormatError
 from btfkit.sequence import TABLE, Frame, Sequence, save
 
+pytestmark = pytest.mark.slow
+
 RIG = FakeRig(slow=1.03)
 
 # The made-up rig has no board: where things are is what its document says.

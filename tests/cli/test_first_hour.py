@@ -72,6 +72,7 @@ def typed(capsys: pytest.CaptureFixture[str], *arguments: object, code: int = 0)
 # --- what eval compares
 
 
+@pytest.mark.slow
 def test_eval_takes_what_the_fit_held_out(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = typed(capsys, "fit", "--model", "interpolation", "--holdout", 0.2, "--seed", 3)
     train, test = btfkit.split(40, 0.2, 3)
@@ -144,6 +145,7 @@ def test_a_store_is_the_folder_that_it_was_made_of_and_no_other(tmp_path: Path) 
 # --- what a budget means
 
 
+@pytest.mark.slow
 def test_a_budget_is_what_one_waits_for(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     start = time.perf_counter()
     report = typed(capsys, "fit", "--model", "neubtf", "--budget", "6s", *QUICK)
@@ -746,6 +748,7 @@ def test_a_query_file_is_answered_beside_it_by_default(
     assert queryfile.read(here / "ask.answers.npz").rgb is not None
 
 
+@pytest.mark.slow
 def test_auto_names_the_model_that_it_took(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     writer.write(sample(9), here / "nine.btf.zarr")
     assert run(command, ["fit", "nine.btf.zarr"]) == 0

@@ -16,6 +16,8 @@ from btfkit.devices.faults import FAULTS, Faults
 from btfkit.errors import DeviceError
 from btfkit.sequence import Sequence
 
+pytestmark = pytest.mark.slow
+
 KINDS = ("dark", "flat", "reference", "white", "colour", "target", "sphere", "sample")
 # 2 darks, 2 flats, 3 references, 4 kinds and 4 samples of 2 exposures, 2 darks.
 FRAMES = 25

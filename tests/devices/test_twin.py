@@ -188,6 +188,7 @@ def test_opencv_finds_the_board_where_it_lies():
     assert np.median(np.linalg.norm(off, axis=1)) < 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("view", "light", "least"),
     [((0, 0), (30, 60), 42), ((45, 120), (45, 20), 45), ((75, 40), (70, 90), 40)],

@@ -99,6 +99,7 @@ def agree(rgb: np.ndarray, opacity: np.ndarray, response: Response, rows: np.nda
     assert (rgb[:400] > 0).any()
 
 
+@pytest.mark.slow
 @every_case
 @pytest.mark.parametrize("target", ["npz", pytest.param("exr", marks=pytest.mark.slow)])
 def test_the_reader_in_numpy_follows_bent_rays(target: str, name: str, tmp_path: Path) -> None:

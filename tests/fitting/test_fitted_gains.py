@@ -28,6 +28,7 @@ def matt(count: int, size: int = 16, *, noise: float = 0.01) -> tuple[BTF, np.nd
     return BTF(images.astype(np.float32), light, view, wrap="wrap"), gain
 
 
+@pytest.mark.slow
 def test_known_independent_gains_are_recovered_within_half_a_percent(tmp_path):
     btf, gain = matt(25)
     report = fit(btf, model="lambert", out=tmp_path / "a.safetensors", settings={"gains": True})

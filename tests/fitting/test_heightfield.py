@@ -262,6 +262,7 @@ def test_one_light_and_collinear_lights_are_refused(knit: tuple[Relief, BTF]) ->
         find_relief(replace(btf, light=light / np.linalg.norm(light, axis=1)[:, None]), holdout=0.0)
 
 
+@pytest.mark.slow
 def test_the_verb_writes_relief_mesh_preview_and_report(
     knit: tuple[Relief, BTF], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -32,6 +32,8 @@ from btfkit.materials.neubtf.paper import NeuBTFPaper
 from btfkit.relief.synth import synth_btf
 from btfkit.synthesis import tile_neubtf
 
+pytestmark = pytest.mark.slow
+
 TINY: dict[str, str] = {"batch": "1024"}
 STEPS = 160
 # Nothing but the encoder says what is carried.

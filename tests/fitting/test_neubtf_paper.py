@@ -30,6 +30,8 @@ from btfkit.materials.neubtf.paper import NeuBTFSpec, renderer_shapes
 from btfkit.native.neural.plain import on_disc
 from btfkit.relief.synth import synth_btf
 
+pytestmark = pytest.mark.slow
+
 TINY: dict[str, str] = {"texels": "64", "pairs": "4"}
 
 

@@ -397,6 +397,7 @@ def test_rows_of_a_file_come_whole_and_at_length_one_whatever_batch_is_asked_fir
     np.testing.assert_array_equal(late.rows, again.rows)
 
 
+@pytest.mark.slow
 @compiled
 @pytest.mark.skipif(bool(training.gpu()), reason="there is a GPU: torch trains on it")
 def test_the_compiled_kernels_fit_queries_without_torch(tmp_path):

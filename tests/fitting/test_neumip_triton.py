@@ -26,6 +26,8 @@ from btfkit.fitting.neumip.engines.device import Autograd
 from btfkit.fitting.neumip.engines.triton import Fused, Packing, uncovered
 from btfkit.native.neural import plain
 
+pytestmark = pytest.mark.slow
+
 GPU = torch.cuda.is_available()
 if not GPU:
     # Read when the kernels are first imported.

@@ -38,6 +38,7 @@ def test_adam_takes_the_steps_of_torchs_own_and_goes_on_from_its_state():
         mine.zero_grad(set_to_none=False)
 
 
+@pytest.mark.slow
 def test_a_step_loads_no_compiler():
     code = (
         "import sys, torch\n"

@@ -558,6 +558,7 @@ def samples() -> dict[str, bytes]:
 SAMPLES = samples()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SAMPLES)
 def test_fault_the_end_of_the_file_is_not_checked(opened, kind: str) -> None:
     data = SAMPLES[kind]

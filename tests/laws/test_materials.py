@@ -187,6 +187,7 @@ def test_save_and_load_give_the_same_answers(model: str, tmp_path: Path) -> None
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.slow
 @every_model
 def test_equal_seeds_give_equal_bytes_and_other_seeds_others(model: str, tmp_path: Path) -> None:
     steps, settings = TINY[model]
@@ -287,6 +288,7 @@ def test_a_tile_repeats_exactly(model: str) -> None:
         np.testing.assert_array_equal(there, here)
 
 
+@pytest.mark.slow
 @every_model
 def test_a_sample_that_does_not_tile_goes_on_as_its_border(model: str) -> None:
     material = fitted_to(replace(tiny(), wrap="clamp"), model)

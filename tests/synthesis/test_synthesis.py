@@ -32,6 +32,8 @@ from btfkit.synthesis.period import self_agreement
 from btfkit.synthesis.seam import closed_cut, cut_cost, open_cut
 from btfkit.synthesis.summary import Summary, spread_out
 
+pytestmark = pytest.mark.slow
+
 
 def call(*arguments: object) -> int:
     return run(group, [str(argument) for argument in arguments])

@@ -58,6 +58,7 @@ def test_errors_by_pair_and_by_texel_are_those_of_the_data() -> None:
     assert found.rmse[0, 0] == pytest.approx(0.1 / math.sqrt(2), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_report_is_one_page_without_scripts_in_which_names_are_text(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
