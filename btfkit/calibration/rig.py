@@ -121,7 +121,7 @@ def grid_of(
 ) -> Grid:
     """Texels over the sample's area."""
     sample = sequence.target.get("sample")
-    size = sample.get("size_mm") if isinstance(sample, dict) else None
+    size: Any = sample.get("size_mm") if isinstance(sample, dict) else None
     numbers = isinstance(size, list) and all(isinstance(s, int | float) for s in size)
     if not numbers or len(size) != 2 or not all(0 < s < math.inf for s in size):
         raise CalibrationError(

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 from btfkit.conventions import EPSILON, LEAK, LOOKS, LOWEST_COSINE, STEEPEST
 from btfkit.export import curvature
 from btfkit.export.arrays import holes, narrowed, textures
-from btfkit.export.glsl.code import VECTORS, groups_of, reflectance, sources_of, told, variable
+from btfkit.export.glsl.code import (
+    VECTORS,
+    groups_of,
+    places,
+    reflectance,
+    sources_of,
+    told,
+    variable,
+)
 from btfkit.export.glsl.layers import Source, Weights, arranged, component, grouped, padded
 from btfkit.export.numbers import literal
 from btfkit.export.sections import filled, sections
@@ -226,21 +234,8 @@ class _Writer:
         return found
 
     def _features(self) -> list[str]:
-        program, lines = self.program, []
-        for texture in [*program.textures, *([program.scaling] if program.scaling else [])]:
-            moves = []
-            if isinstance(program.depth, OffsetNetwork):
-                place = f"uv + {literal(texture.view)} * offset" if texture.view else "uv"
-            else:
-                if program.depth is not None and texture.view:
-                    way = "toward" if program.curved else "btfkit_step(view)"
-                    moves.append(f"{literal(texture.view)} * {way}")
-                if program.depth is not None and texture.light:
-                    way = "away" if program.curved else "btfkit_step(light)"
-                    moves.append(f"{literal(-texture.light)} * {way}")
-                place = f"uv + depth * ({' + '.join(moves)})" if moves else "uv"
-            lines += self._looked(texture, place, "level")
-        return lines
+        return [line for texture, place in places(self.program)
+                for line in self._looked(texture, place, "level")]  # fmt: skip
 
     def _curvature(self) -> dict[str, object]:
         """What the texts say of curvature; of curved heights their numbers, holes included."""

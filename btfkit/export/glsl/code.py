@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -229,8 +229,8 @@ def _networks(program: Program, wide: Weights | None) -> list[str]:
     return found
 
 
-def _features(program: Program) -> list[str]:
-    lines = []
+def places(program: Program) -> Iterator[tuple[Texture, str]]:
+    """Textures that the answer reads, and where, in terms that all shading languages share."""
     for texture in [*program.textures, *([program.scaling] if program.scaling else [])]:
         moves = []
         if isinstance(program.depth, OffsetNetwork):
@@ -243,8 +243,12 @@ def _features(program: Program) -> list[str]:
                 way = "away" if program.curved else "btfkit_step(light)"
                 moves.append(f"{literal(-texture.light)} * {way}")
             place = f"uv + depth * ({' + '.join(moves)})" if moves else "uv"
-        lines += _called(texture, place, "level")
-    return lines
+        yield texture, place
+
+
+def _features(program: Program) -> list[str]:
+    return [line for texture, place in places(program)
+            for line in _called(texture, place, "level")]  # fmt: skip
 
 
 def _answer(program: Program, wide: Weights | None) -> list[str]:
