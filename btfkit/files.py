@@ -14,28 +14,38 @@ from pathlib import Path
 _LEAST_ROOM = 1 << 20
 # In a folder that was written whole: the files of it that --force may remove.
 _LIST = ".btfkit"
+# What a Zarr group is known by.
+_GROUP = "zarr.json"
 
 
-def refuse_existing(path: str | os.PathLike[str], *, force: bool, folder: bool = False) -> Path:
+def refuse_existing(
+    path: str | os.PathLike[str], *, force: bool, folder: bool = False, store: bool = False
+) -> Path:
     """`path` as a Path, once it is sure that something can be written there.
 
     Args:
         path: final name. force: whether what has that name already is replaced.
         folder: whether a folder is written; one that is empty may be there.
+        store: whether that folder is a store.
 
     Raises:
-        FileExistsError: it exists and `force` is False; or it is a folder with files that btfkit
-            did not write, which nothing replaces.
+        FileExistsError: it exists and `force` is False; or it is of another kind, or a folder with
+            files that btfkit did not write, which nothing replaces.
         FileNotFoundError: its folder is missing.
         OSError: nothing can be written into its folder, or the disk is full; names `path`.
     """
     final = Path(path)
     if final.is_dir() and not folder:
         raise FileExistsError(f"{final} is a folder; name a file")
+    if folder and not final.name:
+        raise FileExistsError(f"{final} has no name of its own; name the folder to write")
+    if folder and (final.is_symlink() or final.is_file()):
+        kind = "a link" if final.is_symlink() else "a file"
+        raise FileExistsError(f"{final} is {kind}; name a folder")
     empty = final.is_dir() and not any(final.iterdir())
     if final.exists() and not (force or empty):
         raise FileExistsError(f"{final} exists; --force (force=True) replaces it")
-    _refuse_foreign(final)
+    _refuse_foreign(final, store=store)
     if not final.parent.is_dir():
         raise FileNotFoundError(f"{final.parent} is not a folder; create it first")
     probe = final.with_name(f".{secrets.token_hex(8)}.probe")
@@ -55,17 +65,24 @@ def _files(folder: Path) -> Iterator[str]:
             yield path.relative_to(folder).as_posix()
 
 
-def _refuse_foreign(final: Path) -> None:
-    """FileExistsError where a folder holds files that are not known to be btfkit's."""
+def _of_store(parts: tuple[str, ...]) -> bool:
+    """Whether a file is a group's or an array's document, one of its chunks, or of a journal."""
+    return parts[-1] == _GROUP or "c" in parts or parts == ("journal.jsonl",)
+
+
+def _refuse_foreign(final: Path, *, store: bool) -> None:
+    """FileExistsError where a folder holds files that are not known to be btfkit's.
+
+    A store replaces stores, and any other folder such as list what was written into them.
+    """
     if not final.is_dir():
         return
-    group = final / "zarr.json"
-    if group.is_file() and b"btfkit" in group.read_bytes():
-        return
-    try:
-        ours = {_LIST, *(final / _LIST).read_text(encoding="utf-8").splitlines()}
-    except (OSError, UnicodeDecodeError):
-        ours = set()
+    group, ours = final / _GROUP, set()
+    if store and group.is_file() and b"btfkit" in group.read_bytes():
+        ours = {name for name in _files(final) if _of_store(Path(name).parts)}
+    elif not store:
+        with suppress(OSError, UnicodeDecodeError):
+            ours = {_LIST, *(final / _LIST).read_text(encoding="utf-8").splitlines()}
     if foreign := next((name for name in _files(final) if name not in ours), None):
         raise FileExistsError(
             f"{final} holds {foreign}, which btfkit did not write there: nothing replaces it; "
@@ -132,7 +149,7 @@ def whole_folder(path: str | os.PathLike[str], *, force: bool = False) -> Iterat
 
 def replace_folder(partial: Path, final: Path) -> None:
     """Give a finished folder its final name; what had that name before is removed after."""
-    _refuse_foreign(final)
+    _refuse_foreign(final, store=(partial / _GROUP).is_file())
     old = final.with_name(f".{final.name}.{secrets.token_hex(4)}.old")
     if final.exists():
         final.rename(old)

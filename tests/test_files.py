@@ -81,3 +81,27 @@ def test_a_store_is_not_written_over_itself(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="is the source itself"):
         ingest(store, store, force=True)
     assert btfkit.open(store).texture(0).shape
+
+
+def test_a_folder_replaces_no_file_no_link_and_no_store(tmp_path: Path) -> None:
+    (tmp_path / "notes").write_text("mine")
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    (tmp_path / "nowhere").symlink_to(tmp_path / "gone")
+    store = ingest(sources.SOURCES["manifest"](tmp_path), tmp_path / "a.btf.zarr")
+    for name, message in {
+        "notes": "notes is a file; name a folder",
+        "link": "link is a link; name a folder",
+        "nowhere": "nowhere is a link; name a folder",
+        "a.btf.zarr": "which btfkit did not write there",
+        ".": "has no name of its own",
+    }.items():
+        path = Path(name) if name == "." else tmp_path / name
+        with pytest.raises(FileExistsError, match=message):
+            refuse_existing(path, force=True, folder=True)
+    assert (tmp_path / "notes").read_text() == "mine"
+    (Path(str(store)) / "thesis.txt").write_text("years")
+    with pytest.raises(FileExistsError, match=r"holds thesis\.txt"):
+        refuse_existing(Path(str(store)), force=True, folder=True, store=True)
+    (Path(str(store)) / "thesis.txt").unlink()
+    refuse_existing(Path(str(store)), force=True, folder=True, store=True)

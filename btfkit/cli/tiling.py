@@ -48,7 +48,9 @@ def tile_file(
     except FormatError:
         kind = None
     store = kind == "btf" and reader.detect(path)
-    final = refuse_existing(out if out is not None else tile_name(path), force=force, folder=store)
+    final = refuse_existing(
+        out if out is not None else tile_name(path), force=force, folder=store, store=store
+    )
     if store:
         return _tile_store(path, final, drift, force, progress), final
     if kind == "model":

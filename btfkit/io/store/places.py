@@ -180,7 +180,7 @@ def place_of(path: Any, *, force: bool) -> Place:
     """
     where = located(path)
     if isinstance(where, Path):
-        return Folder(refuse_existing(where, force=force, folder=True))
+        return Folder(refuse_existing(where, force=force, folder=True, store=True))
     ours = is_store(where)
     if ours and not force:
         raise FileExistsError(f"{where} exists; --force (force=True) replaces it")
