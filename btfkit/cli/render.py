@@ -63,7 +63,13 @@ btfkit render wool.neumip.safetensors --sweep view -o wool.webp --shape torus"""
 @click.option("--spp", type=click.IntRange(1, 65536), help="Rays a pixel; as needed by default.")
 @click.option("--within", "within_s", type=DurationType(),
               help="Ends with the passes finished by then; the first always is.")  # fmt: skip
-@click.option("--exposure", type=float, default=0.0, show_default=True, help="Stops, PNG only.")
+@click.option(
+    "--exposure",
+    type=click.FloatRange(-100, 100),
+    default=0.0,
+    show_default=True,
+    help="Stops, PNG only.",
+)
 @click.option("--background", type=NumbersType("R,G,B", float),
               help="Linear, PNG only; black, or grey without --light and --env.")  # fmt: skip
 @click.option("--compare", metavar="OTHER", type=LocationType(),
@@ -111,6 +117,8 @@ def render_verb(
     start = time.perf_counter()
     if sum(each is not None for each in (compare, sweep, pairs)) > 1:
         raise click.UsageError("--compare, --sweep and --pairs exclude each other")
+    if compare and show_confidence:
+        raise click.UsageError("--compare compares answers: leave out --show-confidence")
     if size is not None:
         _check_size(size)
     if not all(

@@ -71,8 +71,9 @@ class Header:
             raise ValueError(
                 f"licence = {self.licence!r}, quantity = {self.quantity!r}; expected text"
             )
-        if self.texel_mm is not None and not 0 < self.texel_mm < math.inf:
-            raise ValueError(f"texel_mm = {self.texel_mm}; expected a length")
+        length = 1.0 if self.texel_mm is None else self.texel_mm
+        if not isinstance(length, int | float) or not 1e-9 < length < 1e9:
+            raise ValueError(f"texel_mm = {length!r}; expected a length, 1e-9 to 1e9")
 
     @staticmethod
     def of(btf: BTF) -> Header:

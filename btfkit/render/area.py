@@ -13,6 +13,8 @@ from btfkit.shapes.closed import Floats
 _OBJECT = 1.0
 # Places a side that the panel's light at the origin is summed from.
 _FINE = 64
+# Beyond this size, in distances, its irradiance is no more a sum over so many places.
+_WIDEST, _FARTHEST = 100.0, 1e6
 
 
 @final
@@ -32,6 +34,13 @@ class AreaLight:
     def __init__(self, way: Floats, size: tuple[float, float], distance: float) -> None:
         if not (np.isfinite([*size, distance]).all() and min(*size, distance) > 0):
             raise ValueError(f"a panel of {size[0]:g} x {size[1]:g} at {distance:g}; all above 0")
+        if max(size) > _WIDEST * distance or not 1 / _FARTHEST < min(size) <= distance * _FARTHEST:
+            raise ValueError(
+                f"a panel of {size[0]:g} x {size[1]:g} at {distance:g}; expected at most "
+                f"{_WIDEST:g} times as large as far: --env lights from all around"
+            )
+        if distance > _FARTHEST:
+            raise ValueError(f"a panel at {distance:g}; expected at most {_FARTHEST:g}")
         if distance <= _OBJECT:
             raise ValueError(
                 f"a panel at {distance:g} reaches into the object, of radius 1; put it farther"

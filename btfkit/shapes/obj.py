@@ -71,7 +71,7 @@ def read(path: Path) -> Triangles:
                         corners = [_corner(word, known) for word in words[1:]]
                         thin += len(corners) < 3
                         faces.extend(_cut(corners, tables["v"]))
-                except ValueError as error:
+                except (ValueError, OverflowError) as error:
                     raise FormatError(path, f"line {number}: {error}") from error
             if len(faces) > 9 * MOST_TRIANGLES:
                 raise FormatError(path, f"more than {MOST_TRIANGLES} triangles")

@@ -125,7 +125,9 @@ def test_a_name_cannot_speak_to_the_terminal(
 
 
 @pytest.mark.parametrize("name", ["spec", "provenance", "channels"])
-@pytest.mark.parametrize("told", ["[" * 9999, "__import__('os')", "null", "3", '["a"]', '"a"'])
+@pytest.mark.parametrize(
+    "told", ["[" * 9999, "__import__('os')", "null", "3", '["a"]', '"a"', "1e308"]
+)
 def test_a_header_that_describes_no_material_is_refused_in_one_line(
     name: str, told: str, tmp_path: Path
 ) -> None:
