@@ -69,8 +69,6 @@ def propagate_verb(
 
     Without --model, the only NeuBTF with an encoder in this folder is taken.
     """
-    if not guidance.exists():
-        raise FileNotFoundError(f"{guidance}: no such file")
     from btfkit.propagation import consistency, has_encoder, propagate
 
     source = models or (
