@@ -147,7 +147,7 @@ def test_blurs_are_those_of_the_kernels_trainable(settings):
     inner = fresh(**settings)
     texels = torch.from_numpy(inner.state()["texels"])
     neumip_device.smooth(inner.layout, texels, 1.3)
-    inner.engine._arrays.settle(Step(1, (0, 0), (0.9, 0.99), dense=True, kept=1, blur=1.3))
+    inner.engine.settle(Step(1, (0, 0), (0.9, 0.99), dense=True, kept=1, blur=1.3))
     np.testing.assert_allclose(texels, inner.state()["texels"], atol=1e-6)
 
 

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from sbtfs import random_sbtf
 
 import btfkit
 from btfkit import metrics
@@ -16,10 +17,8 @@ from btfkit.fitting.sbtf import tracing
 from btfkit.fitting.sbtf.holes import opacity_of, thickness_of
 from btfkit.fitting.sbtf.outlines import carved, moved
 from btfkit.fitting.sbtf.tracing import queries_of
-from btfkit.materials.base import Header, Material
-from btfkit.materials.neumip.arrays import aligned, name_arrays
+from btfkit.materials.base import Material
 from btfkit.materials.neumip.material import NeuMIP
-from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.materials.sbtf.material import SBTF
 from btfkit.native.neural import bent
 from btfkit.program import Heights
@@ -55,18 +54,6 @@ def on_cylinders(count: int = 4000, *, bends: tuple[float, float] = (0.05, 0.85)
     bend = np.exp(rng.uniform(*np.log(bends), count)) / -float(relief().height.min())
     sharp = np.full(count, 0.5, np.float32)
     return Query(rng.random((count, 2), np.float32), light, view, sharp, bend.astype(np.float32))
-
-
-def random_sbtf(heights: np.ndarray, **changes) -> SBTF:
-    """Random weights over given heights, tile widths."""
-    spec = NeuMIPSpec(heights.shape, offset=0, heights=True, curved=True, **changes)
-    header, rng = Header(grid=heights.shape), np.random.default_rng(2)
-    case = spec.layout(header)
-    weights = (0.3 * rng.standard_normal(case.weights)).astype(np.float32)
-    texels = aligned(case.texels)
-    texels[:] = rng.standard_normal(texels.shape)
-    case.surface(texels)[:] = heights / spec.depth_scale
-    return SBTF(spec, name_arrays(spec, case, weights, texels), header)
 
 
 @pytest.mark.slow

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from sbtfs import random_sbtf
 
 from btfkit import metrics
-from btfkit.materials.base import Header
-from btfkit.materials.neumip.arrays import aligned, name_arrays
-from btfkit.materials.neumip.spec import NeuMIPSpec
 from btfkit.materials.sbtf.footprints import offsets
-from btfkit.materials.sbtf.material import SBTF
 from btfkit.native.neural.lookup import bilinear
 from btfkit.queries import Query
 from btfkit.relief import procedural
@@ -28,18 +25,6 @@ VIEW, PICTURE = np.array([0.5, -0.35, 0.79]), 96
 
 def relief(size: int = 32, texels: float = 4.0) -> Relief:
     return procedural.make("cobbles", size, relief_texels=texels).under_surface()[0]
-
-
-def model(heights: np.ndarray) -> SBTF:
-    """An SBTF of given heights, tile widths, and random colours."""
-    spec = NeuMIPSpec(heights.shape, offset=0, heights=True, curved=True, precision="float32")
-    header, rng = Header(grid=heights.shape), np.random.default_rng(2)
-    case = spec.layout(header)
-    weights = (0.3 * rng.standard_normal(case.weights)).astype(np.float32)
-    texels = aligned(case.texels)
-    texels[:] = rng.standard_normal(texels.shape)
-    case.surface(texels)[:] = heights / spec.depth_scale
-    return SBTF(spec, name_arrays(spec, case, weights, texels), header)
 
 
 def sharpest(made: Triangles) -> float:
@@ -80,7 +65,9 @@ def outlines(name: str, tiles: tuple[int, int], bend: float) -> tuple[float, flo
     truth = rays_to((fine.corner - middle) / size).blocks(origin, direction, beyond)
     solid = shape.blocks(origin, direction, beyond)
     light = np.array([[0.3, 0.5, 0.8]])
-    cover = render(Scene(model(height), shape, light), view=VIEW, size=(PICTURE, PICTURE)).cover
+    cover = render(
+        Scene(random_sbtf(height), shape, light), view=VIEW, size=(PICTURE, PICTURE)
+    ).cover
     return metrics.iou(solid, truth), metrics.iou(cover.ravel() > 0.5, truth)
 
 
@@ -117,7 +104,7 @@ def on_cylinders(depth: float, count: int) -> Query:
 @pytest.mark.parametrize("level", [1, 2, 3])
 def test_opacity_under_a_footprint_is_the_share_of_its_rays_that_are_stopped(level: int) -> None:
     known = relief()
-    material, query = model(known.height), on_cylinders(-float(known.height.min()), 400)
+    material, query = random_sbtf(known.height), on_cylinders(-float(known.height.min()), 400)
     wide = query._replace(footprint=np.full(400, 0.5 * 2**level, np.float32))
     truth = trace(known, wide, samples=36).opacity
     soft = material.evaluate(*wide).opacity
@@ -132,7 +119,7 @@ def test_opacity_under_a_footprint_is_the_share_of_its_rays_that_are_stopped(lev
 
 def test_a_footprint_that_moves_changes_opacity_by_small_steps() -> None:
     known = relief()
-    material, query = model(known.height), on_cylinders(-float(known.height.min()), 200)
+    material, query = random_sbtf(known.height), on_cylinders(-float(known.height.min()), 200)
     blur = np.full(200, 2.0, np.float32)
     # A tenth of a texel a frame.
     frames = np.stack([
@@ -149,7 +136,7 @@ def test_a_footprint_that_moves_changes_opacity_by_small_steps() -> None:
 
 def test_several_lights_see_the_soft_outlines_that_one_does() -> None:
     known = relief()
-    material, query = model(known.height), on_cylinders(-float(known.height.min()), 300)
+    material, query = random_sbtf(known.height), on_cylinders(-float(known.height.min()), 300)
     blur = np.full(300, 1.5, np.float32)
     light = np.float32([[0, 0, 1], [0.6, 0, 0.8], [0, -0.6, 0.8]])
     shared = material.evaluate(query.uv, light[:, None], query.view, blur, query.curvature)
@@ -173,7 +160,7 @@ def test_places_of_a_footprint_have_its_mean_and_its_variance() -> None:
 @pytest.mark.parametrize("wide", [1e3, 1e30])
 def test_footprints_of_many_tiles_have_the_mean_opacity_of_all_places(wide: float) -> None:
     known = relief()
-    material, query = model(known.height), on_cylinders(-float(known.height.min()), 60)
+    material, query = random_sbtf(known.height), on_cylinders(-float(known.height.min()), 60)
     found = material.evaluate(*query._replace(footprint=np.full(60, wide, np.float32)))
     assert np.isfinite(found.reflectance).all()
     one = Query(*(np.repeat(part[:1], 4000, axis=0) for part in query))

@@ -137,8 +137,9 @@ class Copier:
             return None
         some = _some(len(rows), _MOST_PLACES)
         rows, cols = rows[some], cols[some]
-        filters = _components(_around(answer, SEEN // 2, wrap=wrap), rows, cols)
-        seen = F.conv2d(_around(answer, SEEN // 2, wrap=wrap)[None], filters)[0]
+        whole = _around(answer, SEEN // 2, wrap=wrap)
+        filters = _components(whole, rows, cols)
+        seen = F.conv2d(whole[None], filters)[0]
         return Copier(filters, torch.stack([rows, cols], 1), seen[:, rows, cols].T, channels)
 
     def __call__(self, answer: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from btfkit.btf import BTF
 from btfkit.fitting.loop import State, Trainable
 from btfkit.fitting.neumip.data import Batch
 from btfkit.fitting.neumip.engines.base import MOMENTS, PARAMETERS, Engine, Step
-from btfkit.fitting.neumip.engines.compiled import Compiled
+from btfkit.fitting.neumip.engines.compiled import Compiled, OnCPU
 from btfkit.fitting.neumip.recipe import Recipe
 from btfkit.fitting.neumip.settings import INPUTS, Settings, Stepped
 from btfkit.fitting.neumip.start import begin_from, initial_texels, initial_weights
@@ -65,10 +65,10 @@ class Marching(Recipe[S]):
                 room = aligned(layout.texels) if name == "texels" else np.zeros_like(flat)
                 arrays[f"{name}.{moment}"] = room
         loss: Loss = self.settings.loss  # type: ignore[assignment]
-        kind: type[Engine[Any]] = Compiled
+        kind: type[OnCPU] = Compiled
         if not available():
             from btfkit.fitting.neumip.engines.plain import Plain as kind
-        self.engine: Engine[Any] = kind(layout, arrays, self._source, loss)  # type: ignore[call-arg]
+        self.engine: Engine[Any] = kind(layout, arrays, self._source, loss)
 
     def join(self, processes: Processes) -> None:
         from btfkit.fitting.neumip.engines.together import Together, follow

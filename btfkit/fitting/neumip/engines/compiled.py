@@ -18,15 +18,19 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-@final
-class Arrays:
+class OnCPU(Engine[Batch]):
     """Weights, texels and their moments in numpy, as `state` names them."""
 
-    def __init__(self, layout: Layout, arrays: dict[str, Array]) -> None:
+    def __init__(
+        self, layout: Layout, arrays: dict[str, Array], source: Source, loss: Loss
+    ) -> None:
         self._layout, self._arrays = layout, arrays
+        self._source, self._loss = source, loss
+
+    def batch(self, number: int, count: int) -> Batch:
+        return self._source.batch(number, count)
 
     def parameters(self) -> tuple[Array, Array]:
-        """Weights and texels."""
         return self._arrays["weights"], self._arrays["texels"]
 
     def slots(self, name: str) -> tuple[Array, Array, Array]:
@@ -49,27 +53,22 @@ class Arrays:
         return bool(good)
 
     def state(self) -> dict[str, Array]:
-        """Copies of all arrays."""
         return {name: array.copy() for name, array in self._arrays.items()}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        """Take back what `state` gave."""
         for name, array in self._arrays.items():
             array[...] = state[name]
 
 
 @final
-class Compiled(Engine[Batch]):
+class Compiled(OnCPU):
     """The kernels: gradients and Adam in C++, summed over its threads in between."""
 
     def __init__(
         self, layout: Layout, arrays: dict[str, Array], source: Source, loss: Loss
     ) -> None:
-        self._arrays, self._source, self._loss = Arrays(layout, arrays), source, loss
+        super().__init__(layout, arrays, source, loss)
         self._kernel = Kernel(layout)
-
-    def batch(self, number: int, count: int) -> Batch:
-        return self._source.batch(number, count)
 
     def take(self, batch: Batch, step: Step) -> float:
         # The kernel keeps its gradients.
@@ -88,11 +87,11 @@ class Compiled(Engine[Batch]):
         return self._moved(float(loss), step)
 
     def _moved(self, loss: float, step: Step) -> float:
-        weights, texels = (self._arrays.slots(name) for name in PARAMETERS)
+        weights, texels = (self.slots(name) for name in PARAMETERS)
         self._kernel.adam(
             weights, texels, lr=step.rates, step=step.number, betas=step.betas, dense=step.dense
         )
-        return loss if self._arrays.settle(step) else math.nan
+        return loss if self.settle(step) else math.nan
 
     def _gradients(self, batch: Batch) -> float:
         loss, _ = self._kernel.train(
@@ -105,12 +104,3 @@ class Compiled(Engine[Batch]):
         """A call that takes the gradient of one and the same batch again: the kernel alone."""
         batch = self.batch(0, count)
         return lambda: self._gradients(batch)
-
-    def parameters(self) -> tuple[Array, Array]:
-        return self._arrays.parameters()
-
-    def state(self) -> dict[str, Array]:
-        return self._arrays.state()
-
-    def restore(self, state: Mapping[str, Array]) -> None:
-        self._arrays.restore(state)
