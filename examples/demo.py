@@ -48,7 +48,7 @@ def make_guidance() -> None:
     from skimage import data
 
     if not (HERE / "guidance.png").exists():
-        cv2.imwrite(str(HERE / "guidance.png"), data.gravel()[:384, :512])
+        cv2.imwrite(str(HERE / "guidance.png"), data.gravel()[:384, :384])
 
 
 def overview() -> None:
