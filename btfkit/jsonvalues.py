@@ -28,3 +28,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return str(float(value))
     return value
+
+
+def tuples(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a record as JSON holds them, with tuples where JSON has lists."""
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}

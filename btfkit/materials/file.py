@@ -17,6 +17,7 @@ from safetensors import SafetensorError, safe_open
 from btfkit.coverage import Coverage
 from btfkit.errors import FormatError
 from btfkit.files import whole
+from btfkit.jsonvalues import tuples
 from btfkit.materials import MODELS, material_class, present_name
 from btfkit.materials.base import Header, Material
 from btfkit.materials.lobes import LobeTable
@@ -112,11 +113,11 @@ def load(path: str | os.PathLike[str]) -> Material:
             known = ", ".join(sorted(MODELS))
             raise FormatError(path, f"model {model!r}; this version knows {known}")
         kind = material_class(model)
-        spec = kind.spec_type(**_tuples(described))
+        spec = kind.spec_type(**tuples(described))
         fields = {name: json.loads(metadata[name]) for name in _FIELDS}
         table = arrays.pop(LOBES, None)
         weights = {n: a for n, a in arrays.items() if not n.startswith(COVERAGE)}
-        header = replace(Header(**_tuples(fields)), coverage=_coverage(arrays))
+        header = replace(Header(**tuples(fields)), coverage=_coverage(arrays))
         material: Material = kind(spec, weights, header)
         if table is None:
             return material
@@ -189,8 +190,3 @@ def _checked_metadata(
             path, f"file version {metadata['btfkit']}; this version reads up to {VERSION}"
         )
     return dict(metadata)
-
-
-def _tuples(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON has lists where specs and headers have tuples."""
-    return {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}

@@ -107,12 +107,7 @@ def put_together(parts: Sequence[AnyNeuBTF], labels: NDArray[np.intp]) -> Compos
             stacklevel=3,
         )
     licences = sorted({header.licence or "not stated" for header in headers})
-    alike = all(
-        header.coverage is not None
-        and first.coverage is not None
-        and _same(header.coverage.arrays(), first.coverage.arrays())
-        for header in others
-    )
+    alike = all(header.coverage == first.coverage for header in others)
     header = replace(
         first,
         texel_mm=min(sizes) if sizes else None,
@@ -128,12 +123,6 @@ def put_together(parts: Sequence[AnyNeuBTF], labels: NDArray[np.intp]) -> Compos
         return Composite.of([part for part in parts if isinstance(part, NeuBTF)], labels, header)
     except ValueError as error:
         raise FitError(f"materials that cannot be put together: {error}") from error
-
-
-def _same(ours: dict[str, NDArray[Any]], theirs: dict[str, NDArray[Any]]) -> bool:
-    return ours.keys() == theirs.keys() and all(
-        np.array_equal(array, theirs[name]) for name, array in ours.items()
-    )
 
 
 def _labels(mask: str | os.PathLike[str] | NDArray[Any], models: Sequence[str]) -> NDArray[np.intp]:

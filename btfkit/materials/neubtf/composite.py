@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from btfkit.footprint import level_sizes, most_levels
+from btfkit.jsonvalues import tuples
 from btfkit.materials.base import Array, Header, Material
 from btfkit.materials.neubtf.material import NeuBTF, averaged
 from btfkit.materials.neumip.spec import NeuMIPSpec
@@ -145,5 +146,4 @@ def _spec_of(described: Mapping[str, Any]) -> NeuMIPSpec:
     known = {field.name for field in fields(NeuMIPSpec)}
     if unknown := described.keys() - known:
         raise ValueError(f"a material with {', '.join(sorted(unknown))}")
-    told: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in described.items()}
-    return NeuMIPSpec(**told)
+    return NeuMIPSpec(**tuples(described))
