@@ -153,6 +153,7 @@ CRASHES = """
         if force or not out.exists():
             assert child(resumed) == 0, f"step {k}"
             left = {each.name for each in folder.iterdir()}
+            left |= {each.name for each in out.rglob("*")}
             assert not any("partial" in name or "lock" in name for name in left), left
     print(len(chosen), chosen[-1])
 """

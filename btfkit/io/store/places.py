@@ -109,6 +109,9 @@ class Folder(Place):
 
     def finish(self, attributes: Mapping[str, Any]) -> None:
         self.group().attrs.update(dict(attributes))
+        # What Zarr was writing when an earlier run was killed; nobody writes here any more.
+        for left in self._folder.rglob("*.partial"):
+            left.unlink()
         # The journal goes last: a run killed in between has nothing to do again.
         replace_folder(self._folder, self._final)
         Journal(self._final).remove()
