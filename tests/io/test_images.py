@@ -348,6 +348,26 @@ def test_what_is_no_image_is_refused(name: str, data: bytes) -> None:
         images.read(name, data, transfer="srgb")
 
 
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"", "the file is empty; copy it again"),
+        (bytes(900), "nothing but 900 zeros"),
+        (b"RIFF\x24\0\0\0WEBPVP8L", "a WebP picture.*; save it as PNG or TIFF"),
+        (b"GIF89a\1\0\1\0", "a GIF"),
+        (b"\0\0\0\x18ftypheic\0\0", "a HEIF picture"),
+        (b"\0\0\0\x18ftypcrx \0\0", "RAW file.*; develop it"),
+        (b"\x76\x2f\x31\x01\2\0\0\0", r"OpenEXR.*; let its name end in \.exr"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "Git LFS.*git lfs pull"),
+        (b"<!DOCTYPE html><title>404", "a web page.*; fetch the picture"),
+        (b"nothing that is known", "neither PNG, JPEG, BMP nor TIFF"),
+    ],
+)
+def test_what_is_no_picture_of_ours_is_named(data: bytes, said: str) -> None:
+    with pytest.raises(FormatError, match=said):
+        headers.size_of("a.png", data)
+
+
 @pytest.mark.parametrize("kind", ["png", "jpeg", "bmp", "tiff"])
 def test_the_declared_size_is_what_an_independent_reader_finds(kind: str) -> None:
     buffer = BytesIO()
