@@ -6,7 +6,7 @@ what was measured. No torch here.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from btfkit.btf import BTF, RGB, Wrap
 from btfkit.native.lobe import Lobes, Start, better, fit_lobes, shaded
-from btfkit.relief.photometric import normal_of, rank_window
+from btfkit.relief.photometric import Normals, normal_of, rank_window
 from btfkit.relief.relief import Relief
 from btfkit.relief.stack import Stack, read_stack, visibility
 
 Array = NDArray[np.float32]
 Floats = NDArray[Any]
+Mask = NDArray[np.bool_]
 
 # What gloss is taken for where data do not say; two starts, since a lobe has two valleys.
 _GLOSS, _ROUGHNESS = 0.04, (0.25, 0.6)
@@ -90,6 +91,8 @@ def fit_maps(
     normals: Array | None = None,
     heights: Array | None = None,
     stack: Stack | None = None,
+    start: Normals | None = None,
+    seen: tuple[Mask, Mask] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Maps:
     """Reflectance maps of a BTF.
@@ -100,6 +103,10 @@ def fit_maps(
         heights: (h, w) tile widths: where each view sees a texel's point, and what the relief
             itself hides from light and view; None is flat.
         stack: the BTF's values where they were read before; None reads them.
+        start: lobes found before, which each fit begins with; None begins twice, with a narrow
+            lobe and a wide one.
+        seen: of `stack` and `heights`, where the relief hides neither: (lights, h, w) of
+            `stack.lights` and (views, h, w) of `stack.views`; None asks the relief.
         progress: called with (rows done, rows).
 
     Raises:
@@ -109,15 +116,23 @@ def fit_maps(
     for name, given, shape in (("normals", normals, (h, w, 3)), ("heights", heights, (h, w))):
         if given is not None and given.shape != shape:
             raise ValueError(f"{name} have shape {given.shape}; expected {shape}")
-    values = _fewer(read_stack(btf) if stack is None else stack)
+    stack = read_stack(btf) if stack is None else stack
     flat = np.zeros((h, w), np.float32) if heights is None else heights * np.float32(w)
-    seen = None if heights is None else _seen(values, flat)
+    few = _fewer(len(stack.pairs))
+    reached = None
+    if heights is not None:
+        lit, looked = seen or (
+            visibility(flat, d, wrap=stack.wrap) for d in (stack.lights, stack.views)
+        )
+        reached = lit[stack.light_of[few]] & looked[stack.view_of[few]]
+    values = stack if few.all() else stack.subset(few)
     step = max(_MOST_VALUES // (w * len(values.pairs) * values.values.shape[3]), 1)
     parts = []
     for first in range(0, h, step):
         rows = slice(first, min(first + step, h))
         given = None if normals is None else slope_of(normals[rows].reshape(-1, 3))
-        parts.append(_rows(values, flat, seen, given, rows))
+        begin = None if start is None else start.lobes(rows)
+        parts.append(_rows(values, flat, reached, given, begin, rows))
         if progress:
             progress(rows.stop, h)
     lobes = Lobes(*(np.concatenate([part[0][k] for part in parts]) for k in range(7)))
@@ -125,14 +140,11 @@ def fit_maps(
     return maps_of(lobes, bright, counts, normals, (h, w))
 
 
-def _fewer(stack: Stack) -> Stack:
-    """As many pairs as a lobe needs, drawn at random."""
-    n = len(stack.pairs)
-    if n <= _MOST_PAIRS:
-        return stack
+def _fewer(n: int) -> Mask:
+    """(n,) as many pairs as a lobe needs, drawn at random."""
     keep = np.zeros(n, bool)
     keep[np.random.default_rng(0).permutation(n)[:_MOST_PAIRS]] = True
-    return stack.subset(keep)
+    return keep
 
 
 def slope_of(normal: Floats) -> Array:
@@ -140,14 +152,13 @@ def slope_of(normal: Floats) -> Array:
     return (-normal[..., :2] / np.maximum(normal[..., 2:], _STEEPEST)).astype(np.float32)
 
 
-def _seen(stack: Stack, height: Array) -> NDArray[np.bool_]:
-    """(n, h, w) where the relief hides neither light nor view."""
-    lit, looked = (visibility(height, d, wrap=stack.wrap) for d in (stack.lights, stack.views))
-    return lit[stack.light_of] & looked[stack.view_of]
-
-
 def _rows(
-    stack: Stack, height: Array, seen: NDArray[np.bool_] | None, given: Array | None, rows: slice
+    stack: Stack,
+    height: Array,
+    seen: Mask | None,
+    given: Array | None,
+    begin: Start | None,
+    rows: slice,
 ) -> tuple[Lobes, Array, Array]:
     values = stack.seen(stack.values, height, rows)
     measured = np.logical_and.reduce(np.isfinite(values), axis=2)
@@ -157,46 +168,48 @@ def _rows(
     place = stack.place(height, rows)
     with np.errstate(invalid="ignore"):
         grey: Array = values @ np.full(values.shape[2], 1 / values.shape[2], np.float32)
+    starts = _starts(stack, grey, weight, place) if begin is None else [begin]
+    if given is not None:
+        starts = [start._replace(slope=given) for start in starts]
+    lobes = _fitted(stack, values, weight, place, starts, given is None)
+    bright = np.where(weight > 0, grey, 0).sum(axis=1) / np.maximum((weight > 0).sum(axis=1), 1)
+    return lobes, bright.astype(np.float32), (weight > 0).sum(axis=1).astype(np.float32)
+
+
+def _starts(stack: Stack, grey: Array, weight: Array, place: Array) -> list[Start]:
+    """A narrow lobe and a wide one on the slopes of the window of ranks."""
     towards: Floats = stack.light
     if stack.light_near is not None:
         rays = stack.light_near[None] - place[:, None]
         towards = rays / np.linalg.norm(rays, axis=2, keepdims=True)
     slope, albedo = rank_window(grey, weight, towards)
-    if given is not None:
-        slope = given
-    lobes = _fitted(stack, values, weight, place, slope, albedo, given is None)
-    bright = np.where(weight > 0, grey, 0).sum(axis=1) / np.maximum((weight > 0).sum(axis=1), 1)
-    return lobes, bright.astype(np.float32), (weight > 0).sum(axis=1).astype(np.float32)
+    gloss = np.full((len(grey), 1), _GLOSS, np.float32)
+    return [
+        Start(slope, np.full(len(grey), roughness, np.float32), albedo[:, None], gloss)
+        for roughness in _ROUGHNESS
+    ]
 
 
 def _fitted(
-    stack: Stack,
-    values: Array,
-    weight: Array,
-    place: Array,
-    slope: Array,
-    albedo: Array,
-    free: bool,
+    stack: Stack, values: Array, weight: Array, place: Array, starts: Sequence[Start], free: bool
 ) -> Lobes:
+    """The best of the fits from `starts`, whose albedo and specular are (t, 1), grey."""
     near = stack.light_near is not None, stack.view_near is not None
     light = stack.light if stack.light_near is None else stack.light_near
     view = stack.view if stack.view_near is None else stack.view_near
-    t, _, c = values.shape
+    c = values.shape[2]
+    count = c if c in (1, 3) else 1
+    part = values if count == c else values.mean(axis=2, keepdims=True)
 
     def fit(part: Array, start: Start, *, slopes: bool, rough: bool) -> Lobes:
         return fit_lobes(
             part, weight, light, view, start, slopes=slopes, rough=rough, place=place, near=near
         )
 
-    def begun(roughness: Array, count: int) -> Start:
-        wide = np.repeat(albedo[:, None], count, axis=1)
-        return Start(slope, roughness, wide, np.full((t, count), _GLOSS, np.float32))
-
     found: Lobes | None = None
-    count = c if c in (1, 3) else 1
-    part = values if count == c else values.mean(axis=2, keepdims=True)
-    for roughness in _ROUGHNESS:
-        other = fit(part, begun(np.full(t, roughness, np.float32), count), slopes=free, rough=True)
+    for start in starts:
+        wide = (np.repeat(grey, count, axis=1) for grey in (start.albedo, start.specular))
+        other = fit(part, Start(start.slope, start.roughness, *wide), slopes=free, rough=True)
         found = other if found is None else better(found, other)
     assert found is not None
     if count == c:

@@ -20,7 +20,7 @@ from btfkit.fitting.heightfield import orientation
 from btfkit.fitting.heightfield.alone import SWEEPS, by_light
 from btfkit.fitting.heightfield.bounds import Bounds, shadow_bounds
 from btfkit.fitting.heightfield.fusion import Fused, fuse
-from btfkit.fitting.heightfield.parallax import Sweep, disagreement, fitted_heights, reached, sweep
+from btfkit.fitting.heightfield.parallax import Sweep, disagreement, fitted_heights, sweep
 from btfkit.heldout import split
 from btfkit.relief.integration import integrate
 from btfkit.relief.photometric import (
@@ -105,7 +105,7 @@ def find_relief(
         btf, budget_s=budget_s, start=start, bounded=bounded, seed=seed, progress=progress
     )
     height = solved.heights[solved.best]
-    lit, seen = (reached(height, d, wrap=stack.wrap) for d in (stack.lights, stack.views))
+    lit, seen = (visibility(height, d, wrap=stack.wrap) for d in (stack.lights, stack.views))
     sure = np.isfinite(solved.deviation)
     confidence = np.where(
         sure,
@@ -114,8 +114,9 @@ def find_relief(
     )
     shape = bare(height, wrap=btf.wrap)
     maps = fit_maps(
-        btf, normals=shape.normals(), heights=shape.height, stack=stack, progress=progress
-    )
+        btf, normals=shape.normals(), heights=shape.height, stack=stack,
+        start=solved.normals, seen=(lit, seen), progress=progress,
+    )  # fmt: skip
     relief = maps.relief(
         shape.height, wrap=btf.wrap, texel_mm=btf.texel_mm, channels=btf.channels,
         confidence=confidence.astype(np.float32), name="heightfield",
@@ -143,8 +144,13 @@ def find_relief(
     }
     return Found(
         relief, solved.normals, solved.heights, solved.deviation, stack.lights, stack.views,
-        lit, seen, maps, held, figures,
+        _share(lit), _share(seen), maps, held, figures,
     )  # fmt: skip
+
+
+def _share(reached: NDArray[np.bool_]) -> Array:
+    """(h, w) share of directions (n, h, w) that reach the surface; few make a guess of it."""
+    return reached.mean(axis=0).astype(np.float32)
 
 
 @final
