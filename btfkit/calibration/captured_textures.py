@@ -128,8 +128,7 @@ class CapturedTextures(Textures):
         if not group:
             return _unseen(self.shape[1:])
         where = self.footprints(index)
-        sensor = self._frame_size(group)
-        window = where.window(*sensor)
+        window = where.window(*self._sequence.frame_size)
         merged = self._merged(group, window)
         if merged is None:
             return _unseen(self.shape[1:])
@@ -170,13 +169,6 @@ class CapturedTextures(Textures):
         if waiting is None:
             raise CalibrationError(f"the sensor's noise is not known, and so no {name}")
         return waiting
-
-    def _frame_size(self, group: tuple[int, ...]) -> tuple[int, int]:
-        sensor = self._sequence.sensor
-        if sensor.height is None or sensor.width is None:
-            h, w = self._sequence.image(group[0]).shape[:2]
-            return h, w
-        return sensor.height, sensor.width
 
     def footprints(self, index: int) -> Footprints:
         """Where the texels of a texture lie in its frames; all lights of a view share them."""

@@ -17,7 +17,7 @@ from btfkit.calibration.geometry import Geometry
 from btfkit.calibration.intrinsics import SingleCamera, calibrate_camera
 from btfkit.calibration.merge import SATURATED
 from btfkit.calibration.mirrors import highlight
-from btfkit.calibration.nominal import LAMP, nominal, section_of
+from btfkit.calibration.nominal import LAMP, nominal
 from btfkit.calibration.radiometry import Radiometry
 from btfkit.sequence import Frame, Sequence
 
@@ -68,7 +68,7 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
         CalibrationError: a rig or board that is not described, or frames that do not show it.
     """
     start = nominal(sequence)
-    board = Board.from_json(section_of(sequence.target, "board", "target"))
+    board = Board.from_json(sequence.target.get("board", {}))
     groups = list(sequence.groups("target").values())
     frames = [sequence.frames[group[0]] for group in groups]
     pictures = [grey(radiometry, sequence, group)[0] for group in groups]
