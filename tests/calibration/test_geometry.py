@@ -367,6 +367,17 @@ def test_nearly_parallel_views_hold_what_they_cannot_tell_and_name_it():
     assert found.rms["corner"] < 0.05
 
 
+def test_pixels_of_a_markers_cell_are_those_of_the_frame():
+    # 10 mm squares, 7 mm markers of 7 cells, at 500 px / 200 mm: 2.5 px a cell.
+    camera = Camera(400, 300, np.array([500.0, 500, 200, 150, 0, 0, 0, 0, 0]))
+    ahead = Rigid(np.diag([1.0, -1, -1]), np.array([0, 0, 200.0]))
+    assert BOARD.cell_px(camera.project(ahead(BOARD.corners_mm))) == pytest.approx(2.5)
+    tilted = ahead @ Rigid.from_vectors([np.radians(60), 0, 0], [0, 0, 0])
+    assert BOARD.cell_px(camera.project(tilted(BOARD.corners_mm))) == pytest.approx(1.25, rel=0.05)
+    behind = Rigid(np.eye(3), np.array([0, 0, -200.0]))
+    assert np.isnan(BOARD.cell_px(camera.project(behind(BOARD.corners_mm))))
+
+
 def test_parallel_views_of_a_free_camera_are_refused(monkeypatch):
     rng = np.random.default_rng(10)
     rig = turntables.Turntable(rng)
@@ -386,6 +397,18 @@ def test_frames_without_a_board_are_refused_with_their_number():
     blank = [np.full((80, 100), 0.5)] * 4
     with pytest.raises(CalibrationError, match=r"seen in 0 of 4 frames; at least 3 are needed"):
         calibrate_camera(blank, BOARD)
+    with pytest.raises(
+        CalibrationError,
+        match=r"100 x 80 a marker of 7 mm is at most 7\.8 pixels wide, 1\.1 for each of its 7 cells; "
+        r"3 are needed from above, 4 tilted.*sensor of more pixels",
+    ):
+        calibrate_camera(blank, BOARD)
+    # What the rig says of its camera tells more; enough pixels are no cause.
+    with pytest.raises(CalibrationError, match=r"is 17\.5 pixels wide, 2\.5 for"):
+        calibrate_camera(blank, BOARD, cell_px=[2.5, 2.4, np.nan, 2.6])
+    for enough in ([5.0] * 4, [np.nan] * 4):
+        with pytest.raises(CalibrationError, match=r"are needed; check target\.board"):
+            calibrate_camera(blank, BOARD, cell_px=enough)
     rig = turntables.Turntable(np.random.default_rng(0))
     two = sightings(rig, [readings(0), readings(5)], 0, np.random.default_rng(0))
     with pytest.raises(CalibrationError, match="2 frames show known points"):
