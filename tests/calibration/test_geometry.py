@@ -378,6 +378,34 @@ def test_pixels_of_a_markers_cell_are_those_of_the_frame():
     assert np.isnan(BOARD.cell_px(camera.project(behind(BOARD.corners_mm))))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("spread_deg", [0.0, 0.3])
+def test_nearly_coplanar_views_tell_their_plane_and_say_how_little_they_tell_across_it(spread_deg):
+    rng = np.random.default_rng(14)
+    rig = turntables.Turntable(rng)
+    turns = np.radians(20 + spread_deg * np.sin(3 * np.arange(16)))
+    views = [{**readings(k), "turn": turn} for k, turn in enumerate(turns)]
+    found = adjust(nominal(rig, spheres=False), sightings(rig, views, 0.02, rng))
+    assert np.isfinite(found.covariance).all()
+    assert 1 < found.condition < 1e7
+    assert found.rms["corner"] < 0.04
+    within, across = (
+        angle_deg(found.geometry.view_position(at), rig.view_direction(at["tilt"], at["turn"]))
+        for at in ({**readings(11), "turn": np.radians(turn)} for turn in (20, 110))
+    )
+    assert within < 0.002
+    if spread_deg == 0:
+        # An axis that never moved stays as it was drawn: 0.01 rad off.
+        assert sum(name.startswith("axis.turn") for name in found.held) == 4
+        assert across < 3
+    else:
+        # 16 readings of 0.2 degrees rms tell its direction to a tenth of a degree, and it is said.
+        sd = np.hypot(*(found.sd(f"axis.turn.direction.{k}") for k in (0, 1)))
+        assert 0.05 < np.degrees(sd) < 0.5
+        # Through the tilt the axis's error counts twice at most, for a turn of 90 degrees.
+        assert across < 2 * 3 * np.degrees(sd)
+
+
 def test_parallel_views_of_a_free_camera_are_refused(monkeypatch):
     rng = np.random.default_rng(10)
     rig = turntables.Turntable(rng)
