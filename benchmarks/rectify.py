@@ -14,6 +14,7 @@ import time
 import numpy as np
 
 from btfkit.calibration.camera_model import Camera
+from btfkit.calibration.demosaic import colours_of
 from btfkit.calibration.kinematics import Rigid
 from btfkit.calibration.merge import merge_exposures
 from btfkit.calibration.noise import NoiseModel
@@ -42,10 +43,12 @@ def rate(pairs: int, rng: np.random.Generator) -> dict[str, float]:
             c, s = np.cos(tilt), np.sin(tilt)
             turn = np.diag([1.0, -1, -1]) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
             where = footprints(camera, Rigid(turn, np.array([0, 0, 700.0])), grid, mosaic=True)
-            rows, columns = where.window(1000, 1000)
+            rows, columns = where.window(1000, 1000, margin=4)
         merged = merge_exposures([f[rows, columns] for f in raw], times, noise)
-        rectify(merged.radiance[..., None], where, variance=merged.variance[..., None],
-                sites=sites, origin=(rows.start, columns.start), threads=1)  # fmt: skip
+        rectify(
+            merged.radiance[..., None], where, variance=merged.variance[..., None], sites=sites,
+            colours=colours_of(merged, "RGGB"), origin=(rows.start, columns.start), threads=1,
+        )  # fmt: skip
     seconds = (time.process_time() - start) / pairs
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     return {"pairs": pairs, "cpu_s": seconds, "minutes_6561_two_cores": seconds * 6561 / 120,

@@ -14,8 +14,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, final
 
-import numpy as np
-
 from btfkit import io
 from btfkit.btf import BTF
 from btfkit.errors import FormatError
@@ -26,7 +24,6 @@ from btfkit.io.store import writer
 from btfkit.io.store.places import place_of
 from btfkit.jsonvalues import plain
 from btfkit.remote import Location, Remote, located
-from btfkit.textures import HALF_RANGE, Array, Textures
 
 # Files up to this size are hashed whole; of larger ones the two ends and the size.
 _HASH_WHOLE = 1 << 30
@@ -166,35 +163,11 @@ def ingest_on_found_relief(
         ingest(source, first, format=name, options=given, part=part, phase=phase,
                progress=progress, **{**writing, "force": False})  # fmt: skip
         told("finding the relief")
-        found = find_relief(_within_half(io.open(first)), seed=seed, progress=progress).relief
+        found = find_relief(io.open(first), seed=seed, progress=progress).relief
         relief_file.write(found.of_three(), relief, unit="mm", force=force)
     given["relief"] = relief
     return ingest(source, final, format=name, options=given, part=part, phase=phase,
                   progress=progress, **writing), relief  # fmt: skip
-
-
-@final
-class _Scaled(Textures):
-    """Textures of another unit."""
-
-    def __init__(self, of: Textures, factor: float) -> None:
-        self._of, self._factor = of, np.float32(factor)
-        self.shape = of.shape
-
-    def _read(self, index: int) -> Array:
-        return self._of[index] * self._factor
-
-
-def _within_half(btf: BTF) -> BTF:
-    """The same in units in which half floats hold it: relative counts a second are large numbers.
-
-    Heights do not depend on the unit; the reflectance found with them is in the other one.
-    """
-    largest = max(float(np.nanmax(btf.texture(i), initial=0.0)) for i in range(len(btf)))
-    if largest <= HALF_RANGE:
-        return btf
-    scaled = _Scaled(btf.textures, 2.0 ** -np.ceil(np.log2(largest)))
-    return replace(btf, textures=scaled, variance=None)
 
 
 def recorded(

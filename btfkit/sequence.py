@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, final
 
@@ -140,6 +141,16 @@ class Sequence:
             group = self.frames[i].group
             found.setdefault(-1 - i if group is None else group, []).append(i)
         return {group: tuple(members) for group, members in found.items()}
+
+    @cached_property
+    def frame_size(self) -> tuple[int, int]:
+        """(h, w) of the sensor; where the document does not say it, of the first frame there is."""
+        sensor = self.sensor
+        if sensor.height is not None and sensor.width is not None:
+            return sensor.height, sensor.width
+        there = (i for i, frame in enumerate(self.frames) if (self.path / frame.file).is_file())
+        h, w = self.image(next(there, 0)).shape[:2]
+        return h, w
 
     def image(self, index: int) -> Counts:
         """(h, w) or (h, w, 3) counts of a frame, uint8, uint16 or float32, as its file has them.

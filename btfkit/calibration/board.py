@@ -71,6 +71,29 @@ class Board:
         """(m, 3) inner corners by their number, board frame."""
         return self._from_print(np.asarray(self._opencv.getChessboardCorners(), float))
 
+    @property
+    def cells(self) -> int:
+        """Cells along a marker, its black border included."""
+        return int(self._bits.shape[-1])
+
+    def cell_px(self, corners: Floats) -> float:
+        """Pixels along the shorter side of a marker's cell, where a frame shows the corners.
+
+        Args:
+            corners: (m, 2) pixels of all inner corners, NaN where one has none; NaN without any.
+        """
+        columns, rows = (count - 1 for count in self.squares)
+        lattice = corners.reshape(rows, columns, 2)
+        sides = [np.linalg.norm(np.diff(lattice, axis=k), axis=-1) for k in (0, 1)]
+        seen = [side[np.isfinite(side)] for side in sides]
+        square = min((float(np.median(side)) for side in seen if side.size), default=np.nan)
+        return square * self.marker_mm / self.square_mm / self.cells
+
+    def most_cell_px(self, width: int, height: int) -> float:
+        """Pixels a cell where the board fills a frame."""
+        square = min(max(width, height) / max(self.squares), min(width, height) / min(self.squares))
+        return square * self.marker_mm / self.square_mm / self.cells
+
     def pattern(self, x: Floats, y: Floats) -> Floats:
         """(...) 1 where the print is white and 0 where black, at places in mm, board frame."""
         columns, rows = self.squares
@@ -78,7 +101,7 @@ class Board:
         column = np.clip(np.floor(u).astype(int), 0, columns - 1)
         row = np.clip(np.floor(v).astype(int), 0, rows - 1)
         markers = self._markers[row, column]
-        bits = self._bits.shape[-1]
+        bits = self.cells
         share = self.marker_mm / self.square_mm
         i = np.floor(((v - row) - (1 - share) / 2) / share * bits).astype(int)
         j = np.floor(((u - column) - (1 - share) / 2) / share * bits).astype(int)
@@ -134,7 +157,7 @@ class Board:
     @cached_property
     def _area(self) -> tuple[Floats, Floats, Floats]:
         """Lines of the print across and up, mm, and the white up to each of them (v, u), mm^2."""
-        bits, share = self._bits.shape[-1], self.marker_mm / self.square_mm
+        bits, share = self.cells, self.marker_mm / self.square_mm
         inside = (1 - share) / 2 + share * np.arange(bits + 1) / bits
         lines = []
         for count in self.squares:

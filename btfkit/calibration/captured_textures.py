@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from btfkit.btf import RGB
 from btfkit.calibration.alignment import Aligned
 from btfkit.calibration.colours import ColourCorrection
-from btfkit.calibration.demosaic import sites
+from btfkit.calibration.demosaic import colours_of, sites
 from btfkit.calibration.merge import Merged
 from btfkit.calibration.nominal import LAMP
 from btfkit.calibration.rectify import Footprints, Grid, Rectified, rectify
@@ -128,8 +128,8 @@ class CapturedTextures(Textures):
         if not group:
             return _unseen(self.shape[1:])
         where = self.footprints(index)
-        sensor = self._frame_size(group)
-        window = where.window(*sensor)
+        # Filters between the samples of a mosaic reach beyond what texels take.
+        window = where.window(*self._sequence.frame_size, margin=4 if self.rig.mosaic else 0)
         merged = self._merged(group, window)
         if merged is None:
             return _unseen(self.shape[1:])
@@ -138,11 +138,18 @@ class CapturedTextures(Textures):
         if image.ndim == 2:
             image, variance = image[..., None], variance[..., None]
         found = rectify(
-            image, where, variance=variance, threads=1,
+            image, where, variance=variance, threads=1, colours=self._between(merged),
             sites=sites(self.rig.radiometry.cfa, (2, 2)).astype(np.int32) if mosaic else None,
             origin=(window[0].start, window[1].start),
         )  # fmt: skip
         return self._scaled(found, self._poses[index])
+
+    def _between(self, merged: Merged) -> Array | None:
+        """(h, w, 3) colours of a mosaic at every pixel; None where their balance is not known."""
+        rig = self.rig
+        if not rig.mosaic or len(np.atleast_1d(rig.scale)) != 3:
+            return None
+        return colours_of(merged, rig.radiometry.cfa, balance=rig.scale)
 
     def cropped(self, rows: slice, cols: slice) -> CapturedTextures:
         """A window of these."""
@@ -170,13 +177,6 @@ class CapturedTextures(Textures):
         if waiting is None:
             raise CalibrationError(f"the sensor's noise is not known, and so no {name}")
         return waiting
-
-    def _frame_size(self, group: tuple[int, ...]) -> tuple[int, int]:
-        sensor = self._sequence.sensor
-        if sensor.height is None or sensor.width is None:
-            h, w = self._sequence.image(group[0]).shape[:2]
-            return h, w
-        return sensor.height, sensor.width
 
     def footprints(self, index: int) -> Footprints:
         """Where the texels of a texture lie in its frames; all lights of a view share them."""

@@ -16,6 +16,7 @@ from btfkit.calibration.rti import LightTable
 from btfkit.errors import CalibrationError
 from btfkit.files import whole_folder
 from btfkit.io import images
+from btfkit.textures import narrowed
 
 Array = NDArray[np.float32]
 Floats = NDArray[np.floating]
@@ -132,7 +133,7 @@ def _written(folder: Path, path: Path, picture: Array, divisor: Any) -> str:
         values = values @ matrix.T.astype(np.float32)
     name = f"{path.stem}.exr"
     channels = "RGB" if picture.shape[2] == 3 else "Y"
-    images.write_exr(folder / name, values.astype(np.float16), tuple(channels))
+    images.write_exr(folder / name, narrowed(values), tuple(channels))
     return name
 
 

@@ -17,7 +17,7 @@ from btfkit.calibration.geometry import Geometry
 from btfkit.calibration.intrinsics import SingleCamera, calibrate_camera
 from btfkit.calibration.merge import SATURATED
 from btfkit.calibration.mirrors import highlight
-from btfkit.calibration.nominal import LAMP, nominal, section_of
+from btfkit.calibration.nominal import LAMP, nominal
 from btfkit.calibration.radiometry import Radiometry
 from btfkit.sequence import Frame, Sequence
 
@@ -68,11 +68,12 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
         CalibrationError: a rig or board that is not described, or frames that do not show it.
     """
     start = nominal(sequence)
-    board = Board.from_json(section_of(sequence.target, "board", "target"))
+    board = Board.from_json(sequence.target.get("board", {}))
     groups = list(sequence.groups("target").values())
     frames = [sequence.frames[group[0]] for group in groups]
     pictures = [grey(radiometry, sequence, group)[0] for group in groups]
-    single = calibrate_camera(pictures, board)
+    cell_px = [_cell_px(start, board, frame) for frame in frames]
+    single = calibrate_camera(pictures, board, cell_px=cell_px)
     sightings, first = [], None
     for frame, view in zip(frames, single.views, strict=True):
         if view is not None:
@@ -103,6 +104,12 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
     ]
     found = adjust(rough, sightings, spheres, slip_sd=slip_sd) if spheres else first_fit
     return Found(found, single, slip_sd)
+
+
+def _cell_px(start: Geometry, board: Board, frame: Frame) -> float:
+    """Pixels that a cell of a marker should have in a frame."""
+    to_camera = start.sample_to_camera(frame.axes) @ start.board
+    return board.cell_px(start.camera.project(to_camera(board.corners_mm)))
 
 
 def slips_of(start: Geometry, sightings: list[Sighting]) -> dict[str, float]:

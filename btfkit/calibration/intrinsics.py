@@ -27,6 +27,9 @@ _LEAST_PX = 0.01
 _FEWEST_VIEWS = 3
 _ROUNDS = 2
 _BLUR_VIEWS = 3
+# Pixels that a cell of a marker needs to be read: on drawn boards of three dictionaries all markers
+# are found from 4 on, from above from 3 on, and next to none below 2.5.
+_CELL_PX = (3.0, 4.0)
 # Views whose boards are more nearly parallel than this tell no focal length.
 _LEAST_TILT_DEG = 5.0
 # Relative standard deviation above which a focal length is not known.
@@ -72,7 +75,11 @@ class SingleCamera:
 
 
 def calibrate_camera(
-    images: Sequence[Floats], board: Board, *, blur_px: float | None = None
+    images: Sequence[Floats],
+    board: Board,
+    *,
+    blur_px: float | None = None,
+    cell_px: Sequence[float] | None = None,
 ) -> SingleCamera:
     """A camera and the poses of a board in its frames.
 
@@ -83,6 +90,8 @@ def calibrate_camera(
         board: what is seen.
         blur_px: standard deviation of the lens's blur, beside the pixel's own square; None
             measures it on those views that look at the board most squarely.
+        cell_px: of a marker, expected in each frame, for the message where none is found; None
+            takes what a board that fills the frame would have.
 
     Raises:
         CalibrationError: fewer than three frames show the board, or their views are too alike.
@@ -90,11 +99,7 @@ def calibrate_camera(
     found = [board.detect(image) for image in images]
     usable = [i for i, (numbers, _) in enumerate(found) if len(numbers)]
     if len(usable) < _FEWEST_VIEWS:
-        raise CalibrationError(
-            f"the board is seen in {len(usable)} of {len(images)} frames; "
-            f"at least {_FEWEST_VIEWS} are needed",
-            remedy="check target.board of sequence.json and the exposure of the target frames",
-        )
+        raise _unseen(images, board, len(usable), cell_px)
     height, width = images[0].shape
     blank = Rigid.identity()
     views = [View(*found[i], blank) for i in usable]
@@ -128,6 +133,35 @@ def calibrate_camera(
     for i, view in zip(usable, views, strict=True):
         by_frame[i] = view
     return SingleCamera(camera, sd, tuple(by_frame), rms, rejected, blur_px)
+
+
+def _unseen(
+    images: Sequence[Floats], board: Board, seen: int, cell_px: Sequence[float] | None
+) -> CalibrationError:
+    """Why the board is not found: markers of too few pixels, else the description or the light."""
+    said = (
+        f"the board is seen in {seen} of {len(images)} frames; at least {_FEWEST_VIEWS} are needed"
+    )
+    remedy = "check target.board of sequence.json and the exposure of the target frames"
+    if len(images):
+        height, width = images[0].shape
+        cell = board.most_cell_px(width, height)
+        if cell_px is not None:
+            cell = float(np.median([px for px in cell_px if np.isfinite(px)] or [np.inf]))
+        if cell < _CELL_PX[0]:
+            marker = cell * board.cells
+            upright, tilted = _CELL_PX
+            said += (
+                f": in frames of {width} x {height} a marker of {board.marker_mm:g} mm is "
+                f"{'at most ' if cell_px is None else ''}{marker:.1f} pixels wide, {cell:.1f} for "
+                f"each of its {board.cells} cells; {upright:g} are needed from above, {tilted:g} "
+                f"tilted ({tilted * board.cells:g} a marker)"
+            )
+            remedy = (
+                "take a sensor of more pixels, a nearer camera, or a board of fewer and larger "
+                "markers"
+            )
+    return CalibrationError(said, remedy=remedy)
 
 
 def _refined(

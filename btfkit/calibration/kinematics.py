@@ -125,7 +125,10 @@ class Kinematics:
                 raise CalibrationError(f"axes carry {body!r}; bodies are {', '.join(BODIES)}")
             lost = [name for name in chain if name not in names]
             if lost:
-                raise CalibrationError(f"axes {lost} carry the {body} and are not in {names}")
+                raise CalibrationError(
+                    f"axes {lost} carry the {body} and are not in {names}",
+                    remedy="add axes of these names, or take them out of carries",
+                )
 
     def axis(self, name: str) -> Axis:
         return next(axis for axis in self.axes if axis.name == name)

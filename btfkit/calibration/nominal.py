@@ -13,7 +13,7 @@ from btfkit.calibration.camera_model import Camera
 from btfkit.calibration.geometry import Geometry
 from btfkit.calibration.kinematics import Axis, Kinematics, Rigid
 from btfkit.errors import CalibrationError
-from btfkit.sequence import Sensor, Sequence
+from btfkit.sequence import Sequence
 
 Floats = NDArray[np.float64]
 # The rig's own lamp, as the sequence has one.
@@ -27,7 +27,7 @@ def nominal(sequence: Sequence) -> Geometry:
     Raises:
         CalibrationError: it lacks what a geometry needs, or garbles it.
     """
-    rig, sensor = sequence.rig, sequence.sensor
+    rig = sequence.rig
     try:
         axes = [
             Axis(str(a["name"]), str(a.get("kind", "rotary")), _vector(a["direction"]),
@@ -38,7 +38,7 @@ def nominal(sequence: Sequence) -> Geometry:
             body: tuple(rig["carries"].get(body, ())) for body in ("sample", "camera", "light")
         }
         lamp = rig.get("light", {})
-        seen_by, pose = _camera(rig["camera"], sensor)
+        seen_by, pose = _camera(rig["camera"], sequence.frame_size)
         lights = {LAMP: _vector(lamp["position_mm"])} if "position_mm" in lamp else {}
         spheres = sequence.target.get("spheres", [])
         centres = np.array([_vector(s["centre_mm"]) for s in spheres]).reshape(-1, 3)
@@ -61,7 +61,7 @@ def stated_camera(sequence: Sequence) -> tuple[Camera, Rigid]:
         CalibrationError: it does not say them.
     """
     try:
-        return _camera(sequence.rig["camera"], sequence.sensor)
+        return _camera(sequence.rig["camera"], sequence.frame_size)
     except (KeyError, TypeError, ValueError) as error:
         raise CalibrationError(
             f"rig.camera of {_DOCUMENT} does not tell the camera ({error!r})",
@@ -73,7 +73,7 @@ def board_pose(sequence: Sequence) -> Rigid:
     """Board to sample, from origin_mm (first outer corner) and drawn axes x and y (down)."""
     if "board" not in sequence.target:
         return Rigid.identity()
-    board = section_of(sequence.target, "board", "target")
+    board = sequence.target["board"]
     size = Board.from_json(board)
     try:
         across = _vector(board.get("x", (1, 0, 0)))
@@ -96,26 +96,14 @@ def board_pose(sequence: Sequence) -> Rigid:
     return Rigid(rotation, middle)
 
 
-def _camera(entry: Mapping[str, Any], sensor: Sensor) -> tuple[Camera, Rigid]:
+def _camera(entry: Mapping[str, Any], size: tuple[int, int]) -> tuple[Camera, Rigid]:
     turn, eye = np.array(entry["rotation"], float), _vector(entry["position_mm"])
     focal, centre = (np.array(entry[key], float) for key in ("focal_px", "centre_px"))
     lens = np.concatenate([focal, centre, np.zeros(5)])
     if turn.shape != (3, 3) or lens.shape != (9,):
         raise ValueError(f"camera of shapes {turn.shape} and {focal.shape}")
-    camera = Camera(int(sensor.need("width")), int(sensor.need("height")), lens)
+    camera = Camera(size[1], size[0], lens)
     return camera, Rigid(turn, -turn @ eye)
-
-
-def section_of(of: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
-    """An object within another one of the document.
-
-    Raises:
-        CalibrationError: there is none.
-    """
-    section = of.get(name)
-    if not isinstance(section, Mapping):
-        raise CalibrationError(f"{_DOCUMENT} has no {where}.{name}", remedy="describe it there")
-    return section
 
 
 def _vector(values: Any) -> Floats:

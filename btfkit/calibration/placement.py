@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.calibration.geometry import Geometry
+from btfkit.calibration.nominal import LAMP
 from btfkit.errors import CalibrationError
-from btfkit.sequence import Frame
+from btfkit.sequence import TABLE, Frame
 
 Floats = NDArray[np.floating]
 _DOCUMENT = "sequence.json"
@@ -61,106 +63,34 @@ def of_directions() -> Placement:
     )  # fmt: skip
 
 
-def calibrated(geometry: Any, light: str) -> Placement:
-    """From a calibrated geometry.
-
-    Args:
-        geometry: of the rig, with `camera`, `sample_to_camera`, `view_position`, `light_position`.
-        light: name of the lamp in it.
-    """
-
-    def project(points: Floats, frame: Frame) -> Floats:
-        seen = geometry.sample_to_camera(frame.axes)(np.asarray(points, float))
-        return np.asarray(geometry.camera.project(seen))
-
-    return Placement(
-        "calibrated", project,
-        lambda frame: np.asarray(geometry.view_position(frame.axes)),
-        lambda frame: np.asarray(geometry.light_position(light, frame.axes)),
-        True,
-    )  # fmt: skip
-
-
-def nominal(rig: Mapping[str, Any]) -> Placement:
-    """From section rig of sequence.json, as it stands: a pinhole without distortion.
+def of_geometry(geometry: Geometry, source: str) -> Placement:
+    """From a rig's geometry, calibrated or as stated.
 
     Raises:
-        CalibrationError: no axes, camera or light in it, or what is none.
+        CalibrationError: it knows no lamp.
     """
-    try:
-        axes = {str(axis["name"]): _Axis.of(axis) for axis in rig["axes"]}
-        carries = {body: [axes[name] for name in rig["carries"].get(body, [])] for body in
-                   ("sample", "camera", "light")}  # fmt: skip
-        camera, lamp = rig["camera"], np.asarray(rig["light"]["position_mm"], float)
-        eye = np.asarray(camera["position_mm"], float)
-        turn = np.asarray(camera["rotation"], float)
-        focal, centre = (np.asarray(camera[key], float) for key in ("focal_px", "centre_px"))
-        if eye.shape != (3,) or turn.shape != (3, 3) or lamp.shape != (3,) or focal.shape != (2,):
-            raise ValueError(f"shapes {eye.shape}, {turn.shape}, {lamp.shape}, {focal.shape}")
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    if LAMP not in geometry.lights_mm:
         raise CalibrationError(
-            f"rig of {_DOCUMENT} does not tell where camera and light are ({error!r})",
+            f"rig of {_DOCUMENT} does not tell where camera and light are (no light.position_mm)",
             remedy="add axes, carries, camera and light, or light_x..z and view_x..z to each frame",
-        ) from error
+        )
+    axes = {name for chain in geometry.kinematics.chains.values() for name in chain}
 
-    def to_sample(body: str, point: Floats, frame: Frame) -> Floats:
-        for axis in reversed(carries[body]):
-            point = axis.moved(point, frame)
-        for axis in carries["sample"]:
-            point = axis.moved(point, frame, back=True)
-        return point
+    def readings(frame: Frame) -> Mapping[str, float]:
+        lost = sorted(axes - frame.axes.keys())
+        if lost:
+            raise CalibrationError(
+                f"{frame.file} has no axis:{lost[0]}",
+                remedy=f"add the column to {TABLE}, or take the axis out of {_DOCUMENT}",
+            )
+        return frame.axes
 
     def project(points: Floats, frame: Frame) -> Floats:
-        seen = np.atleast_2d(np.asarray(points, float))
-        for axis in reversed(carries["sample"]):
-            seen = axis.moved(seen, frame)
-        for axis in carries["camera"]:
-            seen = axis.moved(seen, frame, back=True)
-        local = (seen - eye) @ turn.T
-        return np.asarray(local[:, :2] / local[:, 2:] * focal + centre)
+        return geometry.camera.project(geometry.sample_to_camera(readings(frame))(points))
 
     return Placement(
-        "nominal", project,
-        lambda frame: to_sample("camera", eye, frame),
-        lambda frame: to_sample("light", lamp, frame),
+        source, project,
+        lambda frame: geometry.view_position(readings(frame)),
+        lambda frame: geometry.light_position(LAMP, readings(frame)),
         True,
     )  # fmt: skip
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class _Axis:
-    """A line that something turns about or slides along."""
-
-    name: str
-    direction: Floats
-    point: Floats
-    linear: bool
-
-    @staticmethod
-    def of(entry: Mapping[str, Any]) -> _Axis:
-        direction = np.asarray(entry["direction"], float)
-        point = np.asarray(entry.get("point_mm", (0, 0, 0)), float)
-        with np.errstate(over="ignore"):
-            length = float(np.linalg.norm(direction))
-        if direction.shape != (3,) or point.shape != (3,) or not 0 < length < np.inf:
-            raise ValueError(f"axis {entry['name']!r} has no direction")
-        unit = direction / length
-        return _Axis(str(entry["name"]), unit, point, entry.get("kind") == "linear")
-
-    def moved(self, points: Floats, frame: Frame, *, back: bool = False) -> Floats:
-        """Points (..., 3) after the axis moved to its reading, or back from it."""
-        if self.name not in frame.axes:
-            raise CalibrationError(
-                f"{frame.file} has no axis:{self.name}",
-                remedy="add the column to sequence.csv, or take the axis out of sequence.json",
-            )
-        reading = -frame.axes[self.name] if back else frame.axes[self.name]
-        if self.linear:
-            return np.asarray(points + reading * self.direction)
-        off = points - self.point
-        # Rodrigues' formula.
-        along = (off @ self.direction)[..., None] * self.direction
-        across = np.cross(self.direction, off)
-        turned = np.cos(reading) * off + np.sin(reading) * across + (1 - np.cos(reading)) * along
-        return np.asarray(turned + self.point)

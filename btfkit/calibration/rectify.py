@@ -100,10 +100,13 @@ class Footprints:
         mean, half = (uu + vv) / 2, np.hypot((uu - vv) / 2, uv)
         return np.sqrt(mean + half), np.sqrt(np.maximum(mean - half, 0))
 
-    def window(self, height: int, width: int) -> tuple[slice, slice]:
+    def window(self, height: int, width: int, *, margin: int = 0) -> tuple[slice, slice]:
         """Rows and columns of a frame that texels take anything of; whole 2 x 2 cells of a mosaic.
 
         Empty slices where none is in the frame.
+
+        Args:
+            height, width: of the frame. margin: pixels more on each side, an even number.
         """
         a, b, d = np.moveaxis(self.inverse.astype(float), -1, 0)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -111,8 +114,9 @@ class Footprints:
             low, high = np.floor(self.place - reach), np.ceil(self.place + reach)
         if not np.isfinite(low).any():
             return slice(0, 0), slice(0, 0)
-        first = np.maximum(np.nanmin(low, axis=(0, 1)), 0).astype(int) // 2 * 2
-        last = np.minimum(np.nanmax(high, axis=(0, 1)) + 2, [width, height]).astype(int)
+        first = np.maximum(np.nanmin(low, axis=(0, 1)) - margin, 0).astype(int) // 2 * 2
+        last = np.nanmax(high, axis=(0, 1)) + 2 + margin
+        last = np.minimum(last, [width, height]).astype(int)
         columns, rows = (slice(a, max(a, b)) for a, b in zip(first, last, strict=True))
         return rows, columns
 
@@ -182,6 +186,7 @@ def rectify(
     *,
     variance: Array | None = None,
     sites: NDArray[np.int32] | None = None,
+    colours: Array | None = None,
     origin: tuple[int, int] = (0, 0),
     threads: int | None = None,
 ) -> Rectified:
@@ -192,13 +197,17 @@ def rectify(
         where: footprints of the texels.
         variance: (h', w', c) of the radiance.
         sites: (2, 2) channel of the first pixels of a mosaic.
+        colours: (h', w', 3) of a mosaic, as `demosaic` tells them between its samples: values are
+            gathered from these. Variance and coverage stay those of the samples, since what the
+            other colours add is detail that a texel's kernel averages out.
         origin: row and column of the image's first pixel in the frame.
     """
     h, w = where.place.shape[:2]
     place = where.place.reshape(-1, 2) - [origin[1], origin[0]]
     found = resample.ewa(
-        image, place, where.inverse.reshape(-1, 3), variance=variance, sites=sites, threads=threads
-    )
+        image, place, where.inverse.reshape(-1, 3), variance=variance, sites=sites, colours=colours,
+        threads=threads,
+    )  # fmt: skip
     coverage = found.coverage.min(axis=1).reshape(h, w)
     valid = coverage >= _COVERED
     value = np.where(valid[..., None], found.value.reshape(h, w, -1), np.float32(np.nan))

@@ -87,7 +87,7 @@ class Scene:
         if self.placement.source != "nominal":
             return np.zeros(2)
         white = self.sequence.target.get("white")
-        entries = [*_patches(self), *([white] if isinstance(white, Mapping) else [])]
+        entries = [*_patches(self), *([white] if white else [])]
         return shift_of(merged, entries, frame, self.placement, reach_mm=_OFF_MM)
 
     def lit(self, entry: Mapping[str, Any], frame: Frame, nominal_mm: float | None) -> float:
@@ -146,15 +146,13 @@ def measure_white(scene: Scene, lamp_sd: float = 0.0) -> tuple[Scale, dict[str, 
         CalibrationError: no frames or no description of it, or frames that cannot be used.
     """
     groups = scene.groups("white")
-    entry = scene.sequence.target.get("white")
+    entry = scene.sequence.target.get("white", {})
     if not groups:
         raise CalibrationError(
             "no frames of kind white: reflectance stays relative",
             remedy="capture the white reference",
         )
     diffuser = whites.from_document(entry)
-    if not isinstance(entry, Mapping):
-        raise CalibrationError("target.white of sequence.json is no object")
     at = np.asarray(entry.get("centre_mm", _ORIGIN), float)
     frames = [scene.sequence.frames[group[0]] for group in groups]
     nominal = _near(scene, frames[0])
@@ -255,7 +253,7 @@ def _patches(scene: Scene) -> list[Mapping[str, Any]]:
     """The patches of sequence.json, checked."""
     found = scene.sequence.target.get("patches", [])
     for i, patch in enumerate(found):
-        values = patch.get("reflectance") if isinstance(patch, Mapping) else None
+        values = patch.get("reflectance")
         good = isinstance(values, list) and len(values) == 3
         if not good or not all(isinstance(v, (int, float)) and 0 < v < 1.2 for v in values or []):
             raise CalibrationError(

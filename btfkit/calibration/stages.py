@@ -18,8 +18,8 @@ from btfkit.calibration.geometry import Geometry
 from btfkit.calibration.geometry_stage import fit_geometry
 from btfkit.calibration.lamp_stage import LIT, lamp_factors, lamp_frames
 from btfkit.calibration.noise import Fitted
-from btfkit.calibration.nominal import LAMP
-from btfkit.calibration.placement import Placement, calibrated, nominal, of_directions
+from btfkit.calibration.nominal import LAMP, nominal
+from btfkit.calibration.placement import Placement, of_directions, of_geometry
 from btfkit.calibration.poses import with_poses
 from btfkit.calibration.radiometry import Radiometry
 from btfkit.calibration.references import (
@@ -119,7 +119,7 @@ def placed_by(sequence: Frames, found: Calibration) -> Placement | None:
     geometry = geometry_of(found)
     if any(not sequence.frames[i].axes for i in sequence.of_kind(*POSED)):
         return None
-    return calibrated(geometry, LAMP) if LAMP in geometry.lights_mm else None
+    return of_geometry(geometry, "calibrated") if LAMP in geometry.lights_mm else None
 
 
 def placement_of(sequence: Frames) -> Placement:
@@ -129,7 +129,7 @@ def placement_of(sequence: Frames) -> Placement:
         return of_directions()
     if poses.without_axes(sequence):
         return of_directions()
-    return nominal(sequence.rig)
+    return of_geometry(nominal(sequence), "nominal")
 
 
 def fingerprint(sequence: Frames, name: str, found: Calibration, placed: Placement) -> str:

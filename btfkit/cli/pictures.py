@@ -19,6 +19,7 @@ from btfkit.io.images import exr
 from btfkit.io.images.encoding import jpeg_with_profile, png_with_profile, write_tiff
 from btfkit.io.images.profiles import Declared
 from btfkit.synthesis import IndexMap
+from btfkit.textures import narrowed
 
 _EIGHT_BITS = (".jpg", ".jpeg", ".bmp")
 _TIFF = (".tif", ".tiff")
@@ -85,9 +86,8 @@ class Picture:
         if declared is not None and self.declared is not None:
             values = values.copy()
             values[..., :3] = self.declared.in_own_primaries(values[..., :3])
-        images.write_exr(
-            path, values.astype(np.float16 if half else np.float32), names, chromaticities=declared
-        )
+        kept = narrowed(values) if half else values.astype(np.float32)
+        images.write_exr(path, kept, names, chromaticities=declared)
 
     def _write_tiff(self, path: Path) -> None:
         pixels = self._pixels(self.depth if self.depth.kind == "u" else np.dtype(np.float32))

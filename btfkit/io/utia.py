@@ -24,7 +24,7 @@ from btfkit.io import images, listing, named
 from btfkit.io.archive import Archive
 from btfkit.io.images import Image, exr
 from btfkit.io.images.profiles import CIE_XYZ
-from btfkit.textures import Array
+from btfkit.textures import Array, narrowed
 
 SUFFIXES = {".png", ".exr", ".jpg", ".jpeg"}
 
@@ -171,7 +171,7 @@ def write(
             file.parent.mkdir(exist_ok=True)
             texture = btf.texture(pair)
             if exr:
-                xyz = colour.rgb_to_xyz(texture).astype(np.float16)
+                xyz = narrowed(colour.rgb_to_xyz(texture))
                 images.write_exr(file, xyz, ("R", "G", "B"), chromaticities=CIE_XYZ)
             else:
                 file.write_bytes(images.encode_png(lost.count(texture)))

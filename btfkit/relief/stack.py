@@ -19,10 +19,12 @@ from scipy.ndimage import gaussian_filter
 from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.native import trace as tracer
+from btfkit.textures import HALF_RANGE
 
 Array = NDArray[np.float32]
 Floats = NDArray[Any]
 Progress = Callable[[int, int], None]
+Values = NDArray[np.float16] | NDArray[np.float32]
 
 # Bytes that a stack may take in memory, and on disk where it takes more; pairs beyond which more of
 # them tell a texel little.
@@ -38,7 +40,6 @@ _CLIPPED_TEXELS, _CLIPPED_SHARE = 4, 0.0005
 _SHOWN = 8.0
 # Where visibility is asked, from a texel's centre, texels.
 _BESIDE = np.array([0.13, 0.07], np.float32)
-_LARGEST = float(np.finfo(np.float16).max)
 
 
 @final
@@ -47,8 +48,9 @@ class Stack:
     """Some pairs of a BTF, all values of a texel side by side, sorted by view.
 
     Attributes:
-        values: (h, w, n, c) float16; NaN where not measured or saturated. On disk, in a file
-            without a name, where they are many: all that read them go from rows to rows.
+        values: (h, w, n, c) float16, float32 where one is beyond 6e4; NaN where not measured or
+            saturated. On disk, in a file without a name, where they are many: all that read them
+            go from rows to rows.
         pairs: (n,) of the BTF. light, view: (n, 3) unit vectors.
         light_near, view_near: (n, 3) positions in texels from the centre of the sample, or None.
         light_of, view_of: (n,) which distinct direction each is.
@@ -57,7 +59,7 @@ class Stack:
         unmeasured, saturated: values left out, of all.
     """
 
-    values: NDArray[np.float16]
+    values: Values
     pairs: NDArray[np.intp]
     light: Array
     view: Array
@@ -77,11 +79,11 @@ class Stack:
         return self.values.shape[0], self.values.shape[1]
 
     @cached_property
-    def grey(self) -> NDArray[np.float16]:
+    def grey(self) -> Values:
         """(h, w, n, 1) mean of the channels."""
         if self.values.shape[3] == 1:
             return self.values
-        out = _room((*self.values.shape[:3], 1))
+        out = _room((*self.values.shape[:3], 1), self.values.dtype)
         # Row by row, to spare memory.
         for row, into in zip(self.values, out, strict=True):
             into[..., 0] = row.mean(axis=-1, dtype=np.float32)
@@ -92,7 +94,7 @@ class Stack:
         at = np.flatnonzero(keep)
         lights, light_of = directions.unique(self.light[at])
         views, view_of = directions.unique(self.view[at])
-        values = _room((*self.size, len(at), self.values.shape[3]))
+        values = _room((*self.size, len(at), self.values.shape[3]), self.values.dtype)
         for row, into in zip(self.values, values, strict=True):
             into[...] = row[:, at]
         return replace(
@@ -123,7 +125,7 @@ class Stack:
         for which in range(len(self.views)):
             yield which, slice(int(starts[which]), int(starts[which + 1]))
 
-    def seen(self, values: NDArray[np.float16], height: Array, rows: slice) -> Array:
+    def seen(self, values: Values, height: Array, rows: slice) -> Array:
         """(t, n, c) values of the surface points over the texels of some rows.
 
         Args:
@@ -194,7 +196,7 @@ def read_stack(btf: BTF, *, progress: Progress | None = None) -> Stack:
     order = np.argsort(view_of, kind="stable")
     pairs, light_of, view_of = pairs[order], light_of[order], view_of[order]
     _, h, w, c = btf.shape
-    values = _room((h, w, len(pairs), c))
+    values = _room((h, w, len(pairs), c), np.dtype(np.float16))
     unmeasured = saturated = 0
     for start in range(0, len(pairs), 8):
         run = slice(start, min(start + 8, len(pairs)))
@@ -202,6 +204,8 @@ def read_stack(btf: BTF, *, progress: Progress | None = None) -> Stack:
         images = np.array(btf.batch(pairs[run]), np.float32)
         unmeasured += int((~np.isfinite(images)).any(axis=-1).sum())
         saturated += _leave_out_clipped(images)
+        if values.dtype == np.float16 and np.nanmax(np.abs(images), initial=0) > HALF_RANGE:
+            values = _widened(values, start)
         values[:, :, run] = images.transpose(1, 2, 0, 3)
         if progress:
             progress(run.stop, len(pairs))
@@ -214,13 +218,21 @@ def read_stack(btf: BTF, *, progress: Progress | None = None) -> Stack:
     )  # fmt: skip
 
 
-def _room(shape: tuple[int, ...]) -> NDArray[np.float16]:
+def _room(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Values:
     """An array in memory, or in a temporary file where it is large."""
-    if 2 * math.prod(shape) <= _MOST_BYTES:
-        return np.empty(shape, np.float16)
+    if dtype.itemsize * math.prod(shape) <= _MOST_BYTES:
+        return np.empty(shape, dtype)
     with tempfile.TemporaryFile() as file:
         # The file is gone with its last reader.
-        return np.memmap(file, np.float16, "w+", shape=shape)
+        return np.memmap(file, dtype, "w+", shape=shape)
+
+
+def _widened(values: Values, filled: int) -> Values:
+    """The same in float32; only the first `filled` pairs hold anything yet."""
+    out = _room(values.shape, np.dtype(np.float32))
+    for row, into in zip(values, out, strict=True):
+        into[:, :filled] = row[:, :filled]
+    return out
 
 
 def sampled(values: Floats, row: Floats, col: Floats, *, wrap: bool) -> Array:
@@ -308,7 +320,7 @@ def _leave_out_clipped(images: Array) -> int:
     count = 0
     for image in images:
         largest = np.nanmax(image) if np.isfinite(image).any() else np.nan
-        at = (image >= min(largest, _LARGEST)).any(axis=-1)
+        at = (image >= largest).any(axis=-1)
         share = at.mean()
         if _CLIPPED_SHARE < share < 0.5 and at.sum() >= _CLIPPED_TEXELS:
             image[at] = np.nan

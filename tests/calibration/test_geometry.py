@@ -367,6 +367,45 @@ def test_nearly_parallel_views_hold_what_they_cannot_tell_and_name_it():
     assert found.rms["corner"] < 0.05
 
 
+def test_pixels_of_a_markers_cell_are_those_of_the_frame():
+    # 10 mm squares, 7 mm markers of 7 cells, at 500 px / 200 mm: 2.5 px a cell.
+    camera = Camera(400, 300, np.array([500.0, 500, 200, 150, 0, 0, 0, 0, 0]))
+    ahead = Rigid(np.diag([1.0, -1, -1]), np.array([0, 0, 200.0]))
+    assert BOARD.cell_px(camera.project(ahead(BOARD.corners_mm))) == pytest.approx(2.5)
+    tilted = ahead @ Rigid.from_vectors([np.radians(60), 0, 0], [0, 0, 0])
+    assert BOARD.cell_px(camera.project(tilted(BOARD.corners_mm))) == pytest.approx(1.25, rel=0.05)
+    behind = Rigid(np.eye(3), np.array([0, 0, -200.0]))
+    assert np.isnan(BOARD.cell_px(camera.project(behind(BOARD.corners_mm))))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spread_deg", [0.0, 0.3])
+def test_nearly_coplanar_views_tell_their_plane_and_say_how_little_they_tell_across_it(spread_deg):
+    rng = np.random.default_rng(14)
+    rig = turntables.Turntable(rng)
+    turns = np.radians(20 + spread_deg * np.sin(3 * np.arange(16)))
+    views = [{**readings(k), "turn": turn} for k, turn in enumerate(turns)]
+    found = adjust(nominal(rig, spheres=False), sightings(rig, views, 0.02, rng))
+    assert np.isfinite(found.covariance).all()
+    assert 1 < found.condition < 1e7
+    assert found.rms["corner"] < 0.04
+    within, across = (
+        angle_deg(found.geometry.view_position(at), rig.view_direction(at["tilt"], at["turn"]))
+        for at in ({**readings(11), "turn": np.radians(turn)} for turn in (20, 110))
+    )
+    assert within < 0.002
+    if spread_deg == 0:
+        # An axis that never moved stays as it was drawn: 0.01 rad off.
+        assert sum(name.startswith("axis.turn") for name in found.held) == 4
+        assert across < 3
+    else:
+        # 16 readings of 0.2 degrees rms tell its direction to a tenth of a degree, and it is said.
+        sd = np.hypot(*(found.sd(f"axis.turn.direction.{k}") for k in (0, 1)))
+        assert 0.05 < np.degrees(sd) < 0.5
+        # Through the tilt the axis's error counts twice at most, for a turn of 90 degrees.
+        assert across < 2 * 3 * np.degrees(sd)
+
+
 def test_parallel_views_of_a_free_camera_are_refused(monkeypatch):
     rng = np.random.default_rng(10)
     rig = turntables.Turntable(rng)
@@ -386,6 +425,18 @@ def test_frames_without_a_board_are_refused_with_their_number():
     blank = [np.full((80, 100), 0.5)] * 4
     with pytest.raises(CalibrationError, match=r"seen in 0 of 4 frames; at least 3 are needed"):
         calibrate_camera(blank, BOARD)
+    with pytest.raises(
+        CalibrationError,
+        match=r"100 x 80 a marker of 7 mm is at most 7\.8 pixels wide, 1\.1 for each of its 7 cells; "
+        r"3 are needed from above, 4 tilted.*sensor of more pixels",
+    ):
+        calibrate_camera(blank, BOARD)
+    # What the rig says of its camera tells more; enough pixels are no cause.
+    with pytest.raises(CalibrationError, match=r"is 17\.5 pixels wide, 2\.5 for"):
+        calibrate_camera(blank, BOARD, cell_px=[2.5, 2.4, np.nan, 2.6])
+    for enough in ([5.0] * 4, [np.nan] * 4):
+        with pytest.raises(CalibrationError, match=r"are needed; check target\.board"):
+            calibrate_camera(blank, BOARD, cell_px=enough)
     rig = turntables.Turntable(np.random.default_rng(0))
     two = sightings(rig, [readings(0), readings(5)], 0, np.random.default_rng(0))
     with pytest.raises(CalibrationError, match="2 frames show known points"):

@@ -296,6 +296,16 @@ def test_frames_of_the_wrong_size_are_named(folder):
         stages.calibrate(unsaid)
 
 
+def test_a_frame_that_lacks_an_axis_is_named(folder):
+    def without(frame):
+        return replace(frame, axes={}) if frame.kind == "white" else frame
+
+    sequence = edited(folder, frames=without)
+    name = sequence.frames[sequence.of_kind("white")[0]].file
+    with pytest.raises(CalibrationError, match=rf"{name} has no axis:arm.*add the column"):
+        stages.calibrate(sequence)
+
+
 def test_frames_of_two_gains_are_refused(folder):
     mixed = edited(folder, frames=lambda f: replace(f, iso=100.0 if f.kind == "dark" else 200.0))
     with pytest.raises(CalibrationError, match="frames at ISO 100, 200; a gain holds for one"):

@@ -105,6 +105,15 @@ def test_what_8_bits_cannot_hold_is_counted_and_told_and_exr_keeps_it(tmp_path: 
     assert np.isnan(values[2])
 
 
+def test_an_exr_of_values_beyond_half_floats_is_of_single_ones(tmp_path: Path) -> None:
+    table = directions.bonn81()[:2]
+    btf = shades(table, table[[0, 0]], np.array([0.5, 2e5]))
+    utia.write(btf, tmp_path / "out", exr=True)
+    back = btfkit.open(tmp_path / "out")
+    np.testing.assert_allclose(back.texture(1), 2e5, rtol=1e-5)
+    np.testing.assert_allclose(back.texture(0), 0.5, rtol=2**-9)
+
+
 @pytest.mark.parametrize(
     ("write", "message"), [(ubo2003.write, "1 or 3 channels"), (utia.write, "three channels")]
 )

@@ -11,6 +11,7 @@ from btfkit import directions
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.heightfield.accuracy import filtered
+from btfkit.fitting.heightfield.units import as_reflectance
 from btfkit.native.lobe import Start, shaded
 from btfkit.relief import procedural
 from btfkit.relief.photometric import (
@@ -190,3 +191,25 @@ def test_every_texel_of_a_relief_is_seen_from_straight_above() -> None:
     relief = procedural.make("cobbles", SIDE, relief_texels=3)
     seen = visibility(relief.height * SIDE, np.float32([[0, 0, 1]]), wrap=True)
     assert seen.all()
+
+
+def test_values_beyond_half_floats_are_read_as_they_are_and_tell_the_same_normals() -> None:
+    btf = frontal(bumps(0.3))
+    plain = np.stack([btf.texture(i) for i in range(len(btf))])
+    # Relative counts a second; pairs before the first large one are read as halves.
+    counts = np.float32(2.0**17) * plain
+    counts[:9] /= 2.0**17
+    stack = read_stack(replace(btf, textures=counts))
+    assert stack.values.dtype == stack.grey.dtype == np.float32
+    assert stack.saturated == stack.unmeasured == 0
+    by_pair = np.argsort(stack.pairs)
+    # Half floats of the first eight pairs have eleven bits.
+    np.testing.assert_allclose(
+        stack.values[:, :, by_pair].transpose(2, 0, 1, 3), counts, rtol=2**-11
+    )
+    scaled, unit = as_reflectance(replace(btf, textures=np.float32(2.0**17) * plain))
+    assert as_reflectance(btf)[1] == 1
+    assert np.log2(unit) % 1 == 0
+    found, expected = (photometric_stereo(read_stack(each)).slope for each in (scaled, btf))
+    # In a unit that differs by a power of two; bounds of the reflectance hold in either.
+    assert np.abs(found - expected).mean() < 0.01

@@ -21,6 +21,7 @@ from btfkit.fitting.heightfield.alone import SWEEPS, by_light
 from btfkit.fitting.heightfield.bounds import Bounds, shadow_bounds
 from btfkit.fitting.heightfield.fusion import Fused, fuse
 from btfkit.fitting.heightfield.parallax import Sweep, disagreement, fitted_heights, sweep
+from btfkit.fitting.heightfield.units import as_reflectance
 from btfkit.heldout import split
 from btfkit.relief.integration import integrate
 from btfkit.relief.photometric import (
@@ -86,6 +87,9 @@ def find_relief(
 ) -> Found:
     """The relief of a BTF.
 
+    Of a BTF that cannot be reflectance (relative counts a second) values are divided by a power of
+    two first, the figure "unit": what 1 of the relief's reflectance stands for.
+
     Args:
         btf: what was measured.
         budget_s: wall time for the heights that parallax begins with; the rest takes what it takes.
@@ -100,7 +104,7 @@ def find_relief(
     """
     began, cpu = time.perf_counter(), time.process_time()
     train, held = _split(len(btf), holdout, seed)
-    btf = btf.subset(train)
+    btf, unit = as_reflectance(btf.subset(train))
     stack, solved = find_heights(
         btf, budget_s=budget_s, start=start, bounded=bounded, seed=seed, progress=progress
     )
@@ -120,7 +124,10 @@ def find_relief(
     relief = maps.relief(
         shape.height, wrap=btf.wrap, texel_mm=btf.texel_mm, channels=btf.channels,
         confidence=confidence.astype(np.float32), name="heightfield",
-        provenance={"found": "heightfield", "data": dict(btf.provenance), "licence": btf.licence},
+        provenance={
+            "found": "heightfield", "data": dict(btf.provenance), "licence": btf.licence,
+            **({} if unit == 1 else {"unit": unit}),
+        },
     )  # fmt: skip
     figures = {
         "source": solved.best,
@@ -138,6 +145,7 @@ def find_relief(
         "range_texels": float(np.ptp(height)),
         "offset_texels": float(height.mean()) if solved.why is None else 0.0,
         "clipped_albedo": maps.clipped,
+        "unit": unit,
         **solved.figures,
         "seconds": time.perf_counter() - began,
         "cpu_seconds": time.process_time() - cpu,

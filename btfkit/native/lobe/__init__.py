@@ -20,7 +20,7 @@ Array = NDArray[np.float32]
 Floats = NDArray[Any]
 
 # As in lobe.cpp.
-_GRAZING, _LEAST_ROUGHNESS, _MOST_ALBEDO, _MOST_SLOPE = 1e-4, 0.02, 4.0, 20.0
+_GRAZING, _LEAST_ROUGHNESS, MOST_ALBEDO, _MOST_SLOPE = 1e-4, 0.02, 4.0, 20.0
 _ROUNDS = 14
 # How sharply slopes, roughness, albedo and gloss are held to the start, 1 / deviation^2: next to
 # nothing beside data that tell them.
@@ -257,7 +257,7 @@ def _clamped(theta: Floats) -> Floats:
     return np.clip(
         theta,
         np.concatenate([low, np.zeros(2 * channels)]),
-        np.concatenate([high, np.tile([_MOST_ALBEDO, 1.0], channels)]),
+        np.concatenate([high, np.tile([MOST_ALBEDO, 1.0], channels)]),
     )
 
 

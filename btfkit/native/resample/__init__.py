@@ -47,6 +47,7 @@ def ewa(
     *,
     variance: Array | None = None,
     sites: NDArray[np.int32] | None = None,
+    colours: Array | None = None,
     threads: int | None = None,
 ) -> Gathered:
     """Means under elliptical Gaussians, lowered to end at `CUT` without a step.
@@ -57,15 +58,17 @@ def ewa(
         inverse: (t, 3) inverse covariances xx, xy, yy, 1 / pixel^2.
         variance: (h, w, c) of the values.
         sites: (2, 2) channel of the first pixels of a mosaic; it repeats.
+        colours: (h, w, 3) of a mosaic of three colours, told at every pixel, NaN where unusable:
+            values are the means of these. Variance and coverage stay those of the samples.
         threads: None takes the kernels' own.
     """
     kernel = native.load("resample")
     if kernel is None:
-        return ewa_plain(image, place, inverse, variance=variance, sites=sites)
+        return ewa_plain(image, place, inverse, variance=variance, sites=sites, colours=colours)
     out = _empty(image, len(place), sites)
-    kernel.ewa(
-        *_given(image, variance, sites, place, inverse), CUT, threads or native.threads(), *out
-    )
+    *frame, places, shapes = _given(image, variance, sites, place, inverse)
+    full = np.empty(0, np.float32) if colours is None else np.ascontiguousarray(colours, np.float32)
+    kernel.ewa(*frame, full, places, shapes, CUT, threads or native.threads(), *out)
     return Gathered(out[0], None if variance is None else out[1], out[2])
 
 
@@ -76,6 +79,7 @@ def ewa_plain(
     *,
     variance: Array | None = None,
     sites: NDArray[np.int32] | None = None,
+    colours: Array | None = None,
 ) -> Gathered:
     """`ewa` in numpy: one pixel of every texel's window at a time."""
     a, b, d = inverse.astype(float).T
@@ -85,15 +89,23 @@ def ewa_plain(
         reach = np.sqrt(CUT * np.stack([d, a], -1) / det[:, None])
     centre = np.where(good[:, None], place, -1e6)
     near = np.rint(centre).astype(np.int64)
-    sums = _Sums(image, variance, sites, len(place))
+    sums = [_Sums(image, variance, sites, len(place))]
+    if colours is not None:
+        whole = np.isfinite(colours).all(axis=-1, keepdims=True)
+        sums.append(_Sums(np.where(whole, colours, np.nan), None, None, len(place)))
     across, down = np.ceil(np.max(reach[good], axis=0, initial=0.0)).astype(int) + 1
     for y in range(-down, down + 1):
         for x in range(-across, across + 1):
             off = near - centre + np.array([x, y])
             q = a * off[:, 0] ** 2 + 2 * b * off[:, 0] * off[:, 1] + d * off[:, 1] ** 2
             weight = np.where(good & (q < CUT), np.exp(-q / 2) - np.exp(-CUT / 2), 0.0)
-            sums.add(near[:, 1] + y, near[:, 0] + x, weight)
-    return sums.gathered()
+            for each in sums:
+                each.add(near[:, 1] + y, near[:, 0] + x, weight)
+    found = sums[0].gathered()
+    if colours is None:
+        return found
+    between = sums[1].gathered().value
+    return found._replace(value=np.where(np.isfinite(found.value), between, np.float32(np.nan)))
 
 
 def area(

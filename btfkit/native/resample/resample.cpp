@@ -17,9 +17,13 @@ namespace {
 
 constexpr int kMostChannels = 32;
 constexpr int64_t kGrain = 256;
+constexpr int kColours = 3;
+// Weights of a row that are made before they are spent.
+constexpr int64_t kRun = 256;
 
 struct Frame {
     const float *image, *variance;  // variance may be null
+    const float* colours;           // (h, w, 3) of a mosaic between its samples, or null
     int64_t h, w;
     int c, channels;
     int site[2][2];  // channel of a pixel of a mosaic; -1: every pixel has all
@@ -34,9 +38,52 @@ struct Texels {
 // What a texel has gathered so far.
 struct Sums {
     double all[kMostChannels], seen[kMostChannels], value[kMostChannels], variance[kMostChannels];
+    double between[kColours], known;  // of the colours at every pixel, and their weight
 
     void clear(int channels) {
         for (double* sum : {all, seen, value, variance}) std::fill(sum, sum + channels, 0.0);
+        std::fill(between, between + kColours, known = 0.0);
+    }
+    // A run of pixels of a row, from x0 on.
+    void run(const Frame& f, int64_t y, int64_t x0, const double* weight, int64_t count) {
+        if (f.site[0][0] < 0) {
+            for (int64_t i = 0; i < count; ++i) add(f, y, x0 + i, weight[i]);
+            return;
+        }
+        const bool inside = y >= 0 && y < f.h;
+        const int64_t first = inside ? std::clamp<int64_t>(-x0, 0, count) : count;
+        const int64_t last = inside ? std::clamp<int64_t>(f.w - x0, first, count) : count;
+        const int64_t at = y * f.w + x0;
+        for (int parity = 0; parity < 2; ++parity) {
+            const int channel = f.site[y & 1][(x0 + parity) & 1];
+            double a = 0, s = 0, v = 0, q = 0;
+            for (int64_t i = parity; i < count; i += 2) a += weight[i];
+            for (int64_t i = first + ((first ^ parity) & 1); i < last; i += 2) {
+                const float sample = f.image[at + i];
+                if (!std::isfinite(sample)) continue;
+                s += weight[i];
+                v += weight[i] * sample;
+                if (f.variance) q += weight[i] * weight[i] * f.variance[at + i];
+            }
+            all[channel] += a;
+            seen[channel] += s;
+            value[channel] += v;
+            variance[channel] += q;
+        }
+        if (!f.colours) return;
+        double k = 0, r = 0, g = 0, b = 0;
+        for (int64_t i = first; i < last; ++i) {
+            const float* c = f.colours + (at + i) * kColours;
+            if (!std::isfinite(c[0] + c[1] + c[2])) continue;
+            k += weight[i];
+            r += weight[i] * c[0];
+            g += weight[i] * c[1];
+            b += weight[i] * c[2];
+        }
+        known += k;
+        between[0] += r;
+        between[1] += g;
+        between[2] += b;
     }
     void add(const Frame& f, int64_t y, int64_t x, double weight) {
         const bool inside = y >= 0 && y < f.h && x >= 0 && x < f.w;
@@ -59,7 +106,10 @@ struct Sums {
         for (int k = 0; k < f.channels; ++k) {
             const int64_t to = at * f.channels + k;
             const bool any = seen[k] > 1e-6 * std::fabs(all[k]) && all[k] != 0;
-            t.value[to] = any ? float(value[k] / seen[k]) : NAN;
+            if (f.colours)
+                t.value[to] = any && known > 0 ? float(between[k] / known) : NAN;
+            else
+                t.value[to] = any ? float(value[k] / seen[k]) : NAN;
             t.coverage[to] = all[k] != 0 ? float(seen[k] / all[k]) : 0.f;
             if (f.variance) t.variance[to] = any ? float(variance[k] / (seen[k] * seen[k])) : NAN;
         }
@@ -89,10 +139,15 @@ void ewa_some(const Frame& f, const Texels& t, double cut, int64_t from, int64_t
                 // Along a row a Gaussian is a geometric series of a geometric series.
                 double weight = std::exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + d * dy * dy));
                 double ratio = std::exp(-0.5 * (a * (2 * dx + 1) + 2 * b * dy));
-                for (int64_t x = x0; x <= x1; ++x) {
-                    sums.add(f, y, x, std::max(weight - floor, 0.0));
-                    weight *= ratio;
-                    ratio *= step;
+                double run[kRun];
+                for (int64_t x = x0; x <= x1; x += kRun) {
+                    const int64_t count = std::min(kRun, x1 + 1 - x);
+                    for (int64_t i = 0; i < count; ++i) {
+                        run[i] = std::max(weight - floor, 0.0);
+                        weight *= ratio;
+                        ratio *= step;
+                    }
+                    sums.run(f, y, x, run, count);
                 }
             }
         }
@@ -154,11 +209,11 @@ void require(bool good, const char* what) {
     if (!good) throw std::invalid_argument(what);
 }
 
-Frame framed(In<float> image, In<float> variance, In<int32_t> sites) {
+Frame framed(In<float> image, In<float> variance, In<int32_t> sites, const In<float>* colours = nullptr) {
     require(image.ndim() == 3 && image.shape(2) >= 1 && image.shape(2) <= kMostChannels, "image is (h, w, c)");
     require(variance.size() == 0 || variance.size() == image.size(), "variance does not fit the image");
     require(sites.size() == 4, "sites are (2, 2)");
-    Frame f{image.data(), variance.size() ? variance.data() : nullptr, int64_t(image.shape(0)),
+    Frame f{image.data(), variance.size() ? variance.data() : nullptr, nullptr, int64_t(image.shape(0)),
             int64_t(image.shape(1)), int(image.shape(2)), int(image.shape(2)), {}};
     int most = -1;
     for (int i = 0; i < 4; ++i) most = std::max(most, f.site[i / 2][i % 2] = sites.data()[i]);
@@ -166,6 +221,10 @@ Frame framed(In<float> image, In<float> variance, In<int32_t> sites) {
         require(f.c == 1 && most < kMostChannels, "a mosaic has one value a pixel");
         for (int i = 0; i < 4; ++i) require(sites.data()[i] >= 0, "a site without a channel");
         f.channels = most + 1;
+    }
+    if (colours && colours->size()) {
+        require(most == kColours - 1 && colours->size() == image.size() * kColours, "colours do not fit a mosaic of three");
+        f.colours = colours->data();
     }
     return f;
 }
@@ -180,9 +239,9 @@ Texels asked(const Frame& f, In<double> place, In<float> shape, size_t numbers, 
     return {place.data(), shape.data(), value.data(), variance.data(), coverage.data()};
 }
 
-void ewa(In<float> image, In<float> image_variance, In<int32_t> sites, In<double> place, In<float> shape,
-         double cut, int threads, Out<float> value, Out<float> variance, Out<float> coverage) {
-    const Frame f = framed(image, image_variance, sites);
+void ewa(In<float> image, In<float> image_variance, In<int32_t> sites, In<float> colours, In<double> place,
+         In<float> shape, double cut, int threads, Out<float> value, Out<float> variance, Out<float> coverage) {
+    const Frame f = framed(image, image_variance, sites, &colours);
     const Texels t = asked(f, place, shape, 3, value, variance, coverage);
     nb::gil_scoped_release release;
     spread(int64_t(place.shape(0)), kGrain, threads,
@@ -206,8 +265,8 @@ void area(In<float> image, In<float> image_variance, In<int32_t> sites, In<doubl
 }  // namespace
 
 NB_MODULE(_resample, m) {
-    m.def("ewa", &ewa, nb::arg("image"), nb::arg("image_variance"), nb::arg("sites"), nb::arg("place"),
-          nb::arg("shape"), nb::arg("cut"), nb::arg("threads"), nb::arg("value").noconvert(),
+    m.def("ewa", &ewa, nb::arg("image"), nb::arg("image_variance"), nb::arg("sites"), nb::arg("colours"),
+          nb::arg("place"), nb::arg("shape"), nb::arg("cut"), nb::arg("threads"), nb::arg("value").noconvert(),
           nb::arg("variance").noconvert(), nb::arg("coverage").noconvert());
     m.def("area", &area, nb::arg("image"), nb::arg("image_variance"), nb::arg("sites"), nb::arg("place"),
           nb::arg("shape"), nb::arg("nodes"), nb::arg("weights"), nb::arg("threads"),
