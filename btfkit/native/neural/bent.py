@@ -9,6 +9,14 @@ sin t, which is
 
 without cancellation for either sign of k, and for k = 0 the plane's z = -s cot t. All lengths are
 in units of the heights.
+
+Where the surface is no cylinder, four numbers say how a ray through it drifts off that circle.
+With x the share of its way from where it enters to where it would leave, 0 to 1,
+
+    to the side, tile widths:  x (1 - x) (side0 + side1 x)
+    height:                    z (1 + (x - 1/2) (skew0 + skew1 x))
+
+to the right of the way where the tile is seen with u to the right and v down: turned from u to v.
 """
 
 from __future__ import annotations
@@ -40,6 +48,8 @@ _LEAST_SINE = 1e-6
 _LEAST_BEND = 1e-9
 # Depths and heights, units, that a bend is never compared with less than.
 _LEAST_DEPTH = 1e-6
+# Half of the turn on the way through, radians, at least: at a view along the surface it is 0.
+_LEAST_HALF = 1e-6
 
 
 class Rays(NamedTuple):
@@ -53,6 +63,10 @@ class Rays(NamedTuple):
         share: (b,) ray depth of a unit of way, as `plain.step` counts it.
         start, stop: (b,) way where the march begins and ends.
         reaches: (b,) whether the ray reaches the bottom: it cannot pass.
+        drift: (b, 4) side0, side1, skew0, skew1, as the head of this file has them, 0 where the
+            surface is not convex; None for 0 throughout.
+        across: (b, 2) in uv for a tile width to the side.
+        share_of_way: (b,) of the way to where the ray would leave, for a unit of way.
     """
 
     bend: Array
@@ -63,6 +77,9 @@ class Rays(NamedTuple):
     start: Array
     stop: Array
     reaches: Array
+    drift: Array | None
+    across: Array
+    share_of_way: Array
 
 
 class Crossing(NamedTuple):
@@ -73,16 +90,25 @@ class Crossing(NamedTuple):
         opacity: (b,) 1 where they do, 0 where they pass; there the depth is that of the end.
         way: (b,) over the surface, units of heights.
         turn: (b,) angle at the axis between the entry and there, radians.
+        aside: (b, 2) in uv, beside the way that the depth tells; None where nothing drifts.
     """
 
     depth: Array
     opacity: Array
     way: Array
     turn: Array
+    aside: Array | None
 
 
 def meet(
-    found: Heights, uv: Array, view: Array, curvature: Array, *, aspect: float, wrap: bool
+    found: Heights,
+    uv: Array,
+    view: Array,
+    curvature: Array,
+    *,
+    aspect: float,
+    wrap: bool,
+    drift: Array | None = None,
 ) -> Crossing:
     """Where view rays first meet heights on a curved surface.
 
@@ -92,15 +118,19 @@ def meet(
 
     Args:
         found: the heights. uv: (b, 2). view: (b, 3). curvature: (b,) 1/tile width.
+        drift: (b, 4) off the circle, None for none.
     """
     heights = found.heights
     h, w = heights.shape
-    rays = rays_of(found, view, curvature, aspect)
+    rays = rays_of(found, view, curvature, aspect, drift)
     # Where there are holes the ray may pass although it reaches the bottom.
     sure = rays.reaches & (found.opacity is None)
 
     def above(way: Array) -> Array:
-        return gap_over(found, uv + way[:, None] * rays.along, height_at(rays, way), wrap=wrap)
+        place = uv + way[:, None] * rays.along
+        if rays.drift is not None:
+            place = place + aside(rays, way)
+        return gap_over(found, place, height_at(rays, way), wrap=wrap)
 
     def met(high: Array, low: Array, gap: Array, under: Array) -> Array:
         return high + (low - high) * np.clip(gap / np.maximum(gap - under, 1e-12), 0, 1)
@@ -127,7 +157,8 @@ def meet(
     way = met(high, low, gap, under)
     way = np.where(opaque, way, rays.stop)
     depth = -way * rays.share * np.asarray(found.scale, way.dtype)
-    return Crossing(depth, opaque.astype(way.dtype), way, rays.bend * way)
+    beside = None if rays.drift is None else aside(rays, way)
+    return Crossing(depth, opaque.astype(way.dtype), way, rays.bend * way, beside)
 
 
 def gap_over(found: Heights, uv: Array, height: Array, *, wrap: bool) -> Array:
@@ -153,8 +184,10 @@ def sharpest(found: Heights) -> tuple[float, float]:
     return -MOST_BEND / top if top else -np.inf, MOST_BEND / -bottom if bottom else np.inf
 
 
-def rays_of(found: Heights, view: Array, curvature: Array, aspect: float) -> Rays:
-    """The rays of some views (b, 3) under curvatures (b,), 1/tile width."""
+def rays_of(
+    found: Heights, view: Array, curvature: Array, aspect: float, drift: Array | None = None
+) -> Rays:
+    """The rays of some views (b, 3) under curvatures (b,), 1/tile width, and drifts (b, 4)."""
     top, bottom = max(float(found.heights.max()), 0.0), min(float(found.heights.min()), 0.0)
     bend = limited(curvature * found.scale, top, bottom).astype(view.dtype)
     z, square = view[:, 2], view[:, 0] ** 2 + view[:, 1] ** 2
@@ -164,11 +197,19 @@ def rays_of(found: Heights, view: Array, curvature: Array, aspect: float) -> Ray
     length = np.hypot(flat, cosine)
     sine, cosine = flat / length, cosine / length
     start = _way_to(top, bend, sine, cosine)
-    leaves = 2 * np.arcsin(np.minimum(cosine, 1)) / np.where(reaches, 1, bend) - start
+    half = np.arcsin(np.minimum(cosine, 1))
+    leaves = 2 * half / np.where(reaches, 1, bend) - start
     stop = np.where(reaches, _way_to(bottom, bend, sine, cosine), leaves)
     moves = displacement(-view[:, 0], -view[:, 1], flat / found.scale, aspect)
     share = np.maximum(z, LOWEST_COSINE) / flat
-    return Rays(bend, sine, cosine, np.stack(moves, axis=1), share, start, stop, reaches)
+    across = np.stack(displacement(-view[:, 1], view[:, 0], flat, aspect), axis=1)
+    if drift is not None:
+        drift = np.where(bend[:, None] > 0, drift, 0).astype(view.dtype)
+    through = bend / (2 * np.maximum(half, _LEAST_HALF))
+    return Rays(
+        bend, sine, cosine, np.stack(moves, axis=1), share, start, stop, reaches, drift, across,
+        through.astype(view.dtype),
+    )  # fmt: skip
 
 
 def limited(bend: Array, top: float, bottom: float) -> Array:
@@ -185,7 +226,19 @@ def height_at(rays: Rays, way: Array) -> Array:
     sinc = np.where(np.abs(half) < 1e-4, 1, sine / np.where(np.abs(half) < 1e-4, 1, half))
     middle = rays.cosine * cosine - rays.sine * sine
     end = rays.sine * (cosine**2 - sine**2) + rays.cosine * 2 * sine * cosine
-    return -way * sinc * middle / np.maximum(end, 1e-9)
+    height = -way * sinc * middle / np.maximum(end, 1e-9)
+    if rays.drift is None:
+        return height
+    x, skew = way * rays.share_of_way, rays.drift[:, 2:]
+    return height * (1 + (x - 0.5) * (skew[:, 0] + skew[:, 1] * x))
+
+
+def aside(rays: Rays, way: Array) -> Array:
+    """How far (b, 2), uv, rays are beside their straight way."""
+    assert rays.drift is not None
+    x = way * rays.share_of_way
+    side = x * (1 - x) * (rays.drift[:, 0] + rays.drift[:, 1] * x)
+    return side[:, None] * rays.across
 
 
 def falling(rays: Rays, way: Array) -> Array:

@@ -186,9 +186,11 @@ class Model {
     int64_t texels() const { return plan_.texels(); }
 
     void evaluate(In<float> w, In<float> t, In<float> uv, In<float> light, In<float> view,
-                  nb::object footprint, nb::object curvature, Out<float> rgb, nb::object opacity,
-                  int lit, bool raw, int threads, const std::string& name) const {
+                  nb::object footprint, nb::object curvature, nb::object drift, Out<float> rgb,
+                  nb::object opacity, int lit, bool raw, int threads,
+                  const std::string& name) const {
         Batch b = batch(w, t, uv, view, footprint, curvature);
+        if (!drift.is_none()) b.drift = floats(drift, 4 * b.size, "four numbers of drift a query");
         const int64_t outputs = raw ? plan_.decoder.widths.back() : plan_.channels;
         // One light a query, lights that all share, or several of each query's own.
         const bool shared = lit == kShared, each = lit == kEach;
@@ -395,8 +397,8 @@ NB_MODULE(_neural, m) {
         .def_prop_ro("weights", &Model::weights)
         .def_prop_ro("texels", &Model::texels)
         .def("evaluate", &Model::evaluate, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
-             nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg().none(), nb::arg(), nb::arg(),
-             nb::arg(), nb::arg())
+             nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg().none(),
+             nb::arg(), nb::arg(), nb::arg(), nb::arg())
         .def("freeze", &Model::freeze)
         .def("depths", &Model::depths, nb::arg(), nb::arg(), nb::arg(), nb::arg(),
              nb::arg().none(), nb::arg(), nb::arg(), nb::arg())

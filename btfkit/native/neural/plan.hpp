@@ -156,6 +156,7 @@ struct Batch {
     int64_t size = 0;
     const float *uv = nullptr, *light = nullptr, *view = nullptr, *footprint = nullptr;
     const float *curvature = nullptr;  // 1 / tile width; null is the plane
+    const float *drift = nullptr;      // four a query, of rays that curvature bends; null is 0
     const float *target = nullptr, *weight = nullptr;
     float top = 0, bottom = 0;  // of the heights
 };
