@@ -435,10 +435,11 @@ class Material(ABC):
         asked = _spread(ready)
         values, cover = self._answer(asked) if drift is None else self._answer_along(asked, drift)
         rows = slice(None) if ready.rows is None else ready.rows
+        rgb[rows] = values
         if cover is not None:
             opacity[rows] = cover
-            values = np.where(cover[:, None] > 0, values, 0.0)
-        rgb[rows] = values
+            passed = np.flatnonzero(~(cover > 0))
+            rgb[passed if ready.rows is None else ready.rows[passed]] = 0
         return ready.masked
 
     def _ready(

@@ -78,6 +78,8 @@ class SBTF(NeuMIPMaterial):
 
     def _may_pass(self, query: Query) -> NDArray[np.intp]:
         """Rows whose footprint is wider than a texel and of which a part may pass."""
+        if query.footprint.strides == (0,) and not query.footprint[:1] > _SHARP:
+            return np.zeros(0, np.intp)
         wide = np.flatnonzero(query.footprint > _SHARP)
         if not len(wide) or self.spec.holes:
             return wide
@@ -111,15 +113,21 @@ class SBTF(NeuMIPMaterial):
 
     def _bend(self, query: Query) -> Array | None:
         """Curvature (b,); None, which the plane's rays take, where there is none."""
-        if not np.any(query.curvature):
+        bend = np.ascontiguousarray(query.curvature, np.float32)
+        if not len(bend):
+            return None
+        ends = float(bend.min()), float(bend.max())
+        if ends == (0, 0):
             return None
         low, high = self.sharpest
-        self._warn_of_sharp(query.curvature, low, high)
-        return np.ascontiguousarray(np.clip(query.curvature, low, high), np.float32)
+        if ends[0] >= low and ends[1] <= high:
+            return bend
+        self._warn_of_sharp(ends)
+        return np.clip(bend, low, high).astype(np.float32, copy=False)
 
-    def _warn_of_sharp(self, curvature: Array, low: float, high: float) -> None:
-        ends = float(curvature.min()), float(curvature.max())
-        if (ends[0] < low or ends[1] > high) and "sharp" not in self._warned:
+    def _warn_of_sharp(self, ends: tuple[float, float]) -> None:
+        if "sharp" not in self._warned:
+            low, high = self.sharpest
             self._warned.add("sharp")
             worst, most = (ends[1], high) if ends[1] > high else (ends[0], low)
             warnings.warn(

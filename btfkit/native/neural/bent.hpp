@@ -126,7 +126,7 @@ FN F between(F gap, F under) {
 // Way over the surface where rays first meet it; `opaque` tells those that do. (du, dv) is the
 // step in uv of a unit of way.
 template <bool DRIFTS>
-FN F meet_bent(const Surface& surface, const Ray& r, const Drift& d, F u, F v, F du, F dv,
+FN F meet_bent(const Surface surface, const Ray& r, const Drift& d, F u, F v, F du, F dv,
                I& opaque) {
     const F size_u = du < all(0.f) ? -du : du, size_v = dv < all(0.f) ? -dv : dv;
     const F length = r.stop - r.start;

@@ -52,6 +52,20 @@ _LEAST_DEPTH = 1e-6
 _LEAST_HALF = 1e-6
 
 
+class Drift(NamedTuple):
+    """How b rays drift off their circles, as the head of this file has it.
+
+    Attributes:
+        numbers: (b, 4) side0, side1, skew0, skew1; 0 where the surface is not convex.
+        across: (b, 2) in uv for a tile width to the side.
+        part: (b,) share of the way to where the ray would leave, for a unit of way.
+    """
+
+    numbers: Array
+    across: Array
+    part: Array
+
+
 class Rays(NamedTuple):
     """b view rays at a curved surface.
 
@@ -63,10 +77,7 @@ class Rays(NamedTuple):
         share: (b,) ray depth of a unit of way, as `plain.step` counts it.
         start, stop: (b,) way where the march begins and ends.
         reaches: (b,) whether the ray reaches the bottom: it cannot pass.
-        drift: (b, 4) side0, side1, skew0, skew1, as the head of this file has them, 0 where the
-            surface is not convex; None for 0 throughout.
-        across: (b, 2) in uv for a tile width to the side.
-        share_of_way: (b,) of the way to where the ray would leave, for a unit of way.
+        drift: of the rays; None where none drifts.
     """
 
     bend: Array
@@ -77,9 +88,7 @@ class Rays(NamedTuple):
     start: Array
     stop: Array
     reaches: Array
-    drift: Array | None
-    across: Array
-    share_of_way: Array
+    drift: Drift | None = None
 
 
 class Crossing(NamedTuple):
@@ -129,7 +138,7 @@ def meet(
     def above(way: Array) -> Array:
         place = uv + way[:, None] * rays.along
         if rays.drift is not None:
-            place = place + aside(rays, way)
+            place = place + aside(rays.drift, way)
         return gap_over(found, place, height_at(rays, way), wrap=wrap)
 
     def met(high: Array, low: Array, gap: Array, under: Array) -> Array:
@@ -157,7 +166,7 @@ def meet(
     way = met(high, low, gap, under)
     way = np.where(opaque, way, rays.stop)
     depth = -way * rays.share * np.asarray(found.scale, way.dtype)
-    beside = None if rays.drift is None else aside(rays, way)
+    beside = None if rays.drift is None else aside(rays.drift, way)
     return Crossing(depth, opaque.astype(way.dtype), way, rays.bend * way, beside)
 
 
@@ -202,14 +211,12 @@ def rays_of(
     stop = np.where(reaches, _way_to(bottom, bend, sine, cosine), leaves)
     moves = displacement(-view[:, 0], -view[:, 1], flat / found.scale, aspect)
     share = np.maximum(z, LOWEST_COSINE) / flat
+    rays = Rays(bend, sine, cosine, np.stack(moves, axis=1), share, start, stop, reaches)
+    if drift is None:
+        return rays
+    numbers = np.where(bend[:, None] > 0, drift, 0).astype(view.dtype)
     across = np.stack(displacement(-view[:, 1], view[:, 0], flat, aspect), axis=1)
-    if drift is not None:
-        drift = np.where(bend[:, None] > 0, drift, 0).astype(view.dtype)
-    through = bend / (2 * np.maximum(half, _LEAST_HALF))
-    return Rays(
-        bend, sine, cosine, np.stack(moves, axis=1), share, start, stop, reaches, drift, across,
-        through.astype(view.dtype),
-    )  # fmt: skip
+    return rays._replace(drift=Drift(numbers, across, bend / (2 * np.maximum(half, _LEAST_HALF))))
 
 
 def limited(bend: Array, top: float, bottom: float) -> Array:
@@ -229,16 +236,14 @@ def height_at(rays: Rays, way: Array) -> Array:
     height = -way * sinc * middle / np.maximum(end, 1e-9)
     if rays.drift is None:
         return height
-    x, skew = way * rays.share_of_way, rays.drift[:, 2:]
-    return height * (1 + (x - 0.5) * (skew[:, 0] + skew[:, 1] * x))
+    x, skew = way * rays.drift.part, rays.drift.numbers[:, 2:]
+    return np.asarray(height * (1 + (x - 0.5) * (skew[:, 0] + skew[:, 1] * x)))
 
 
-def aside(rays: Rays, way: Array) -> Array:
-    """How far (b, 2), uv, rays are beside their straight way."""
-    assert rays.drift is not None
-    x = way * rays.share_of_way
-    side = x * (1 - x) * (rays.drift[:, 0] + rays.drift[:, 1] * x)
-    return side[:, None] * rays.across
+def aside(drift: Drift, way: Array) -> Array:
+    """How far (b, 2), uv, rays are beside the straight way there."""
+    x, side = way * drift.part, drift.numbers
+    return (x * (1 - x) * (side[:, 0] + side[:, 1] * x))[:, None] * drift.across
 
 
 def falling(rays: Rays, way: Array) -> Array:

@@ -171,7 +171,8 @@ class Model {
     Model(const Model&) = delete;
     Model& operator=(const Model&) = delete;
 
-    // Promises that the texels stay as they are: their range is not looked up again.
+    // Promises that the texels stay as they are: their range is not looked up again, and marches
+    // over curved heights read them as quads.
     void freeze(In<float> t) {
         require(int64_t(t.size()) == texels() * kChannels, "size of the texels");
         frozen_ = false;
@@ -180,6 +181,12 @@ class Model {
         top_ = b.top;
         bottom_ = b.bottom;
         frozen_ = true;
+        if (!plan_.curved) return;
+        const int h = plan_.heights.h, w = plan_.heights.w;
+        quads_ = quads_of(t.data(), h, w, plan_.wrap, bottom_, top_);
+        if (!plan_.holes) return;
+        const float* cover = t.data() + plan_.plane() * kChannels;
+        cover_quads_ = quads_of(cover, h, w, plan_.wrap, 0.f, 1.f);
     }
 
     int64_t weights() const { return int64_t(plan_.weights()); }
@@ -363,6 +370,8 @@ class Model {
         if (frozen_) {
             b.top = top_;
             b.bottom = bottom_;
+            b.quads = quads_.empty() ? nullptr : quads_.data();
+            b.cover_quads = cover_quads_.empty() ? nullptr : cover_quads_.data();
             return;
         }
         float top = -INFINITY, bottom = INFINITY;
@@ -384,6 +393,7 @@ class Model {
     Plan plan_;
     bool frozen_ = false;
     float top_ = 0, bottom_ = 0;
+    std::vector<uint64_t> quads_, cover_quads_;
     std::vector<std::vector<float>> weights_;
     std::vector<Zeros> texels_;
     std::vector<std::vector<uint8_t>> touched_;

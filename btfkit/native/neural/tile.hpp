@@ -32,7 +32,7 @@ struct Tile {
                        bool train)
         : plan(p), texels(t), train_(train) {
         surface = {t, float(p.heights.w), float(p.heights.h), b.top, b.bottom, p.wrap,
-                   p.holes ? t + p.plane() * kChannels : nullptr, p.looks};
+                   p.holes ? t + p.plane() * kChannels : nullptr, p.looks, b.quads, b.cover_quads};
         decoder.pack(p.decoder, weights, train, p.half, p.pairs && L == 16);
         decoder_trace.reset(p.decoder, train);
         if (p.offset) {
