@@ -153,6 +153,7 @@ FN F meet_bent(const Surface surface, const Ray& r, const Drift& d, F u, F v, F 
     F high = r.start, low = high;
     F gap = gap_of<DRIFTS>(surface, r, d, drop / larger(sine, all(1e-9f)), high, u, v, du, dv);
     F under = gap;
+    F near = high, least = all(INFINITY);  // where a ray passes closest by, and by how much
     I going = ~I{};
     const int most = surface.looks > kLooks ? surface.looks : kLooks;
     for (int k = 1; k <= most; ++k) {
@@ -169,6 +170,29 @@ FN F meet_bent(const Surface surface, const Ray& r, const Drift& d, F u, F v, F 
         under = select(going, rest, under);
         going &= (rest > all(0.f)) & (float(k) < count);
         if (!any_of(going)) break;
+        const I nearer = going & (rest < least);
+        near = select(nearer, to, near);
+        least = select(nearer, rest, least);
+    }
+    const I passes = ~sure & (under > all(0.f)) & (least < all(INFINITY));
+    if (any_of(passes)) {
+        const auto look = [&](F way) NEUMIP_TARGET {
+            return gap_of<DRIFTS>(surface, r, d, r.height_at(way), way, u, v, du, dv);
+        };
+        const F half = step * 0.5f, before = look(near - half), after = look(near + half);
+        const I ahead = after < before;
+        const F side = near + select(ahead, half, -half) * 0.5f, beside = look(side);
+        const auto take = [&](F way, F found, F from, F gap_there) NEUMIP_TARGET {
+            const I hit = passes & (found <= all(0.f));
+            low = select(hit, way, low);
+            under = select(hit, found, under);
+            high = select(hit, from, high);
+            gap = select(hit, gap_there, gap);
+        };
+        // The last counts: what is nearest to the viewer.
+        take(near + half, after, near, least);
+        take(side, beside, select(ahead, near, near - half), select(ahead, least, before));
+        take(near - half, before, near - step, least);
     }
     opaque = sure | (under <= all(0.f));
     const F met = high + (low - high) * between(gap, under);

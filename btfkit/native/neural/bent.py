@@ -123,7 +123,9 @@ def meet(
 
     A ray that reaches the bottom is looked at a texel apart, or at LOOKS places where it is longer;
     one that may leave again, or meet a hole, CURVED_FINER times as often, or at `found.looks`
-    places. Between two of them the surface is taken as straight, twice.
+    places. Where it passes all of them, three more look around the one that it passes closest by:
+    half a step to both sides, and a quarter to the closer one. Between two of them the surface is
+    taken as straight, twice.
 
     Args:
         found: the heights. uv: (b, 2). view: (b, 3). curvature: (b,) 1/tile width.
@@ -151,12 +153,32 @@ def meet(
     low = high = rays.start
     under = gap = above(low)
     going = np.ones(len(uv), bool)
+    near, least = rays.start, np.full(len(uv), np.inf, length.dtype)
     for k in range(1, max(found.looks, LOOKS) + 1):
         high, gap = np.where(going, low, high), np.where(going, under, gap)
         to = rays.start + length * np.minimum(k / count, 1).astype(length.dtype)
         rest = above(to)
         low, under = np.where(going, to, low), np.where(going, rest, under)
         going &= (rest > 0) & (k < count)
+        nearer = going & (rest < least)
+        near, least = np.where(nearer, to, near), np.where(nearer, rest, least)
+    passes = ~sure & (under > 0) & np.isfinite(least)
+    half = length / count / 2
+    before, after = above(near - half), above(near + half)
+    side = np.where(after < before, half, -half) / 2
+    beside = above(near + side)
+    for found_at, gap_at, from_, gap_from in (
+        # The last counts: what is nearest to the viewer.
+        (near + half, after, near, least),
+        (
+            near + side, beside, np.where(side > 0, near, near - half),
+            np.where(side > 0, least, before),
+        ),
+        (near - half, before, near - 2 * half, least),
+    ):  # fmt: skip
+        hit = passes & (gap_at <= 0)
+        low, under = np.where(hit, found_at, low), np.where(hit, gap_at, under)
+        high, gap = np.where(hit, from_, high), np.where(hit, gap_from, gap)
     opaque = sure | (under <= 0)
     first = met(high, low, gap, under)
     rest = above(first)
