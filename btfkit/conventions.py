@@ -16,7 +16,7 @@ LEAST_FACING = 0.02
 # Looks at most along a view ray through heights.
 LOOKS = 8
 # Looks at most along a view ray that curvature lets leave the heights again, unless a model says.
-CURVED_LOOKS = 16
+CURVED_LOOKS = 12
 # Looks a texel along such a ray; along others there is one.
 CURVED_FINER = 2.0
 # Curvature x depth of the heights at most: beyond 1 they would reach the axis of curvature.

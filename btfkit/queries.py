@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float32]
+# Of every number of a drift: a ray that is that far off its circle has left what it stands for.
+MOST_DRIFT = 8.0
 
 
 class Query(NamedTuple):
@@ -107,6 +109,24 @@ def flatten(
         raise ValueError(f"leading shapes {leading} do not broadcast") from error
     flat = [_rows(part, shape, part.shape[-1:]) for part in parts]
     return Query(*flat, *(_rows(part, shape, ()) for part in scalars)), shape
+
+
+def flat_drift(drift: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Drifts (..., 4) of queries of a leading shape as (b, 4), held within `MOST_DRIFT`.
+
+    Raises:
+        ValueError: wrong last axis, or a leading shape that does not broadcast to `shape`.
+    """
+    part = np.asarray(drift, np.float32)
+    if part.ndim < 1 or part.shape[-1] != 4:
+        raise ValueError(f"drift has shape {part.shape}; expected (..., 4)")
+    try:
+        every = np.broadcast_to(part, (*shape, 4))
+    except ValueError as error:
+        raise ValueError(
+            f"drift has leading shape {part.shape[:-1]}; the other parts have {shape}"
+        ) from error
+    return np.ascontiguousarray(np.clip(every, -MOST_DRIFT, MOST_DRIFT)).reshape(-1, 4)
 
 
 def _rows(part: NDArray[Any], shape: tuple[int, ...], last: tuple[int, ...]) -> NDArray[Any]:

@@ -113,12 +113,14 @@ class Material(ABC):
         header: what the answers mean and where the material comes from.
         thickness: how deep below its surface rays may go, tile widths, where the material knows
             it and curvature; else 0.
+        has_drift: whether rays are followed off the circle of their curvature.
     """
 
     model: ClassVar[str]
     spec_type: ClassVar[type]
     has_levels: ClassVar[bool] = False
     has_curvature: ClassVar[bool] = False
+    has_drift: ClassVar[bool] = False
     full_sphere: ClassVar[bool] = False
     computed: ClassVar[bool] = False
     thickness: float = 0.0
@@ -168,6 +170,10 @@ class Material(ABC):
         footprint or curvature holds for all, its stride is 0.
         """
 
+    def _answer_along(self, query: Query, drift: Array) -> tuple[Array, Array | None]:
+        """`_answer` of rays that drift, (b, 4), off their circle; called where `has_drift`."""
+        raise NotImplementedError
+
     def _keeps_views(self) -> bool:
         """Whether `_answer_lights` saves anything over asking query by query."""
         return False
@@ -177,11 +183,14 @@ class Material(ABC):
         """Whether several lights of a view cost less together than one by one."""
         return self._keeps_views()
 
-    def _answer_lights(self, query: Query) -> tuple[Array, Array | None]:
+    def _answer_lights(
+        self, query: Query, drift: Array | None = None
+    ) -> tuple[Array, Array | None]:
         """Reflectance (m, b, c) and opacity (b,) of b views under m lights.
 
         As `_answer`, but `query.light` is (m, 3), which all share, or (m, b, 3), where a vector of
-        zeros is not asked and answers 0. Called where `_keeps_views`.
+        zeros is not asked and answers 0. Called where `_keeps_views`, with a drift (b, 4) where
+        `has_drift`.
         """
         raise NotImplementedError
 
@@ -288,6 +297,7 @@ class Material(ABC):
         view: ArrayLike,
         footprint: ArrayLike = 0.5,
         curvature: ArrayLike = 0.0,
+        drift: ArrayLike | None = None,
     ) -> Response:
         """Reflectance and opacity; shapes broadcast.
 
@@ -296,6 +306,11 @@ class Material(ABC):
             light, view: (..., 3) directions away from the surface; normalised here.
             footprint: (...) standard deviation of the Gaussian kernel, texels of the grid.
             curvature: (...) along the projected view ray, 1/tile width, positive convex.
+            drift: (..., 4) side0, side1, skew0, skew1: how the ray's way through a body that is no
+                cylinder drifts off the circle of `curvature`, with x from 0 where it enters to 1
+                where it would leave: x (1 - x) (side0 + side1 x) tile widths to the side, turned
+                from u to v, and 1 + (x - 1/2) (skew0 + skew1 x) times as deep. None for the
+                circle. Only `sbtf` on convex surfaces heeds it; what is beyond 8 counts as 8.
 
         Returns:
             reflectance (..., c) and opacity (...). Queries that are not finite or seen from
@@ -305,16 +320,19 @@ class Material(ABC):
         Raises:
             ValueError: wrong last axes, or shapes that do not broadcast.
         """
-        if self._keeps_views() and queries.share_lights(uv, light, view, footprint, curvature):
+        shared = drift is None and queries.share_lights(uv, light, view, footprint, curvature)
+        if shared and self._keeps_views():
             return self._under_shared_lights(uv, light, view, footprint, curvature)
         query, shape = queries.flatten(uv, light, view, footprint, curvature)
         b, c = math.prod(shape), len(self.header.channels)
+        off = None if drift is None else queries.flat_drift(drift, shape)
         rgb, opacity = np.empty((b, c), np.float32), np.empty(b, np.float32)
         masked = 0
         for start in range(0, b, _BLOCK):
             some = slice(start, start + _BLOCK)
             block = Query(*(part if len(part) == 1 else part[some] for part in query))
-            masked += self._answer_block(block, rgb[some], opacity[some])
+            part = None if off is None else off[some]
+            masked += self._answer_block(block, part, rgb[some], opacity[some])
         _warn_of_masked(masked, b)
         return Response(rgb.reshape(*shape, c), opacity.reshape(shape))
 
@@ -326,11 +344,12 @@ class Material(ABC):
         view: NDArray[Any],
         footprint: NDArray[Any],
         curvature: NDArray[Any],
+        drift: NDArray[Any] | None = None,
     ) -> Response:
         """Each of b views under m lights of its own; what does not depend on light is found once.
 
         Args:
-            uv, view, footprint, curvature: (b, ...) as in `evaluate`.
+            uv, view, footprint, curvature, drift: (b, ...) as in `evaluate`.
             lights: (m, b, 3) float32 unit vectors; of zeros where a light is not asked for, as
                 below the horizon of a material that does not answer there.
 
@@ -345,13 +364,15 @@ class Material(ABC):
                 lit = np.flatnonzero(light.any(axis=1))
                 if lit.size:
                     parts = (uv[lit], light[lit], view[lit], footprint[lit], curvature[lit])
-                    answer[lit], opacity[lit] = self.evaluate(*parts)
+                    own_drift = None if drift is None else drift[lit]
+                    answer[lit], opacity[lit] = self.evaluate(*parts, own_drift)
             return Response(rgb, opacity)
         query, _ = queries.flatten(uv, np.asarray([0, 0, 1]), view, footprint, curvature)
-        ready = self._ready(query, opacity, below=True)
+        off = None if drift is None else queries.flat_drift(drift, (b,))
+        ready, off = self._ready(query, off, opacity, below=True)
         rows: Any = slice(None) if ready.rows is None else ready.rows
         own = np.ascontiguousarray(lights[:, rows])
-        values, found = self._answer_lights(_spread(ready)._replace(light=own))
+        values, found = self._answer_lights(_spread(ready)._replace(light=own), off)
         if found is not None:
             opacity[rows] = found
             values = np.where(found[:, None] > 0, values, np.float32(0))
@@ -387,7 +408,7 @@ class Material(ABC):
         for start in range(0, b, size):
             some = slice(start, start + size)
             block = Query(*(part if len(part) == 1 else part[some] for part in query))
-            ready = self._ready(block, seen[some], below=True)
+            ready, _ = self._ready(block, None, seen[some], below=True)
             rows = slice(None) if ready.rows is None else ready.rows
             cover = seen[some].copy()
             if len(ready.uv) and len(lights.rows):
@@ -402,25 +423,41 @@ class Material(ABC):
         _warn_of_masked(m * b - int(lights.good.sum()) * int(np.count_nonzero(seen)), m * b)
         return Response(rgb.reshape(*shape, c), opacity.reshape(shape))
 
-    def _answer_block(self, query: Query, rgb: Array, opacity: Array) -> int:
+    def _answer_block(
+        self, query: Query, drift: Array | None, rgb: Array, opacity: Array
+    ) -> int:
         """Answer one block into `rgb` and `opacity`; returns how many are masked."""
-        ready = self._ready(query, opacity, below=self.full_sphere)
+        ready, drift = self._ready(query, drift, opacity, below=self.full_sphere)
         if ready.rows is not None:
             rgb[:] = 0
         if not len(ready.uv):
             return ready.masked
-        values, cover = self._answer(_spread(ready))
+        asked = _spread(ready)
+        values, cover = self._answer(asked) if drift is None else self._answer_along(asked, drift)
         rows = slice(None) if ready.rows is None else ready.rows
+        rgb[rows] = values
         if cover is not None:
             opacity[rows] = cover
-            values = np.where(cover[:, None] > 0, values, 0.0)
-        rgb[rows] = values
+            passed = np.flatnonzero(~(cover > 0))
+            rgb[passed if ready.rows is None else ready.rows[passed]] = 0
         return ready.masked
 
-    def _ready(self, query: Query, opacity: Array, *, below: bool) -> Prepared:
+    def _ready(
+        self, query: Query, drift: Array | None, opacity: Array, *, below: bool
+    ) -> tuple[Prepared, Array | None]:
+        """What is to be answered, and the drift of its rays where the model heeds it."""
+        if drift is not None:
+            finite = np.isfinite(drift).all(axis=1)
+            if not finite.all():
+                # What is not finite in one part is masked, whichever it is.
+                query = query._replace(
+                    curvature=np.where(finite, query.curvature, np.nan).astype(np.float32)
+                )
         ready = prepare(*query, opacity, wrap=self.header.wrap == "wrap", below=below)
         self._warn_of_missing_parts(ready)
-        return ready
+        if drift is None or not self.has_drift:
+            return ready, None
+        return ready, drift if ready.rows is None else drift[ready.rows]
 
     def _warn_of_missing_parts(self, ready: Prepared) -> None:
         for part, has, asked in (

@@ -23,6 +23,7 @@ class Gaze(NamedTuple):
         frame: (m, 3, 3) rows x along dp/du, y against dp/dv and the normal on the viewer's side.
         uv: (m, 2) within a tile. view: (m, 3) in the frame.
         footprint, curvature: (m,) as in `Query`.
+        drift: (m, 4) as `Material.evaluate` takes it; (m, 0) where nothing drifts.
         outside: (m,) whether the outside of the shape is seen.
     """
 
@@ -31,7 +32,13 @@ class Gaze(NamedTuple):
     view: Floats
     footprint: Floats
     curvature: Floats
+    drift: Floats
     outside: NDArray[np.bool_]
+
+    @property
+    def told_drift(self) -> Floats | None:
+        """The drift as a query takes it."""
+        return self.drift if self.drift.size else None
 
 
 def gaze(material: Material, shape: Shape, surface: Surface, toward: Floats, pixel: Floats) -> Gaze:
@@ -55,7 +62,7 @@ def gaze(material: Material, shape: Shape, surface: Surface, toward: Floats, pix
     frame = np.stack([x, y, surface.normal * side[:, None]], axis=1)
     view = np.einsum("ijk,ik->ij", frame, toward)
     view[:, 2] = np.maximum(view[:, 2], _LOWEST_Z)
-    curvature = np.zeros(len(view))
+    curvature, drift = np.zeros(len(view)), np.zeros((len(view), 0))
     if material.has_curvature:
         along = _bend_along(surface.bend, dot(x, toward), dot(right_handed, toward))
         curvature = side * shape.tile * along
@@ -70,9 +77,12 @@ def gaze(material: Material, shape: Shape, surface: Surface, toward: Floats, pix
             seen = view[found.rows] / np.linalg.norm(view[found.rows], axis=1, keepdims=True)
             frame[found.rows] = rotation(seen, found.view) @ frame[found.rows]
             view[found.rows], curvature[found.rows] = found.view, found.curvature
+            if material.has_drift and found.drift.any():
+                drift = np.zeros((len(view), 4))
+                drift[found.rows] = found.drift
     footprint = _footprint(material, surface, toward, pixel)
     uv = surface.uv - np.floor(surface.uv)
-    return Gaze(frame, uv, view, footprint, curvature, side > 0)
+    return Gaze(frame, uv, view, footprint, curvature, drift, side > 0)
 
 
 def dot(a: Floats, b: Floats) -> Floats:

@@ -167,7 +167,7 @@ class Painter:
     def _answer(self, seen: Gaze, local: NDArray[np.float32]) -> tuple[Floats, Floats]:
         """What the material answers; what is not finite counts as black and opaque."""
         rgb, cover = self._scene.material.under_lights(
-            seen.uv, local, seen.view, seen.footprint, seen.curvature
+            seen.uv, local, seen.view, seen.footprint, seen.curvature, seen.told_drift
         )
         if np.isfinite(cover).all() and np.isfinite(rgb).all():
             return rgb, cover.astype(float)

@@ -111,7 +111,7 @@ class Shadows:
         seen = gaze(self._material, self._shape, surface, -light, self._pixel)
         self.asked += len(light)
         opacity = self._material.evaluate(
-            seen.uv, _ABOVE, seen.view, seen.footprint, seen.curvature
+            seen.uv, _ABOVE, seen.view, seen.footprint, seen.curvature, seen.told_drift
         ).opacity
         opacity = np.where(np.isfinite(opacity), opacity, 1.0)
         return np.where(seen.outside, opacity, 0.0) if self.body else opacity

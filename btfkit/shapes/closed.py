@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.floating]
 # Roots closer than this to a ray's start are the surface it starts on; shapes are of size 1.
 NEAR = 1e-6
+# Of the stretch from a surface to a parallel one through a point, at least for a step.
+_LEAST_AREA = 0.02
 
 
 class Meeting(NamedTuple):
@@ -52,6 +54,17 @@ class Surface(NamedTuple):
     start: Floats
 
 
+class Foot(NamedTuple):
+    """The surface over points below it: where the normal there passes through them.
+
+    Attributes:
+        uv: (m, 2) tiles. depth: (m,) below it, lengths; not finite where none was found.
+    """
+
+    uv: Floats
+    depth: Floats
+
+
 class Shape(ABC):
     """A surface with tiles on it.
 
@@ -81,6 +94,42 @@ class Shape(ABC):
     @abstractmethod
     def surface(self, origin: Floats, direction: Floats, met: Meeting) -> Surface:
         """The surface where rays meet it; every distance is finite."""
+
+    def foot(self, point: Floats, up: Floats) -> Foot:
+        """The surface over points (m, 3), sought from directions up (m, 3), of length 1.
+
+        A ray upwards meets the surface near the foot, and how it bends there tells where the
+        normal passes through the point: once of Newton's steps.
+        """
+        for last in (False, True):
+            met = self.meet(point, up, np.zeros(len(point)))
+            ended = Meeting(np.where(np.isfinite(met.distance), met.distance, 0.0), met.part)
+            found = self.surface(point, up, ended)
+            if not last:
+                up = _towards_foot(found, up, ended.distance)
+        return Foot(found.uv, met.distance)
+
+
+def _towards_foot(found: Surface, up: Floats, depth: Floats) -> Floats:
+    """Unit directions (m, 3) towards the foot of points `depth` (m,) below what is found.
+
+    Off the foot by e the normal is off by B e and the ray by e / depth, B being the second
+    fundamental form: of the two the difference tells e.
+    """
+    x = found.du / np.maximum(np.linalg.norm(found.du, axis=1, keepdims=True), 1e-30)
+    x = x - found.normal * np.einsum("ij,ij->i", x, found.normal)[:, None]
+    x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-30)
+    y = np.cross(found.normal, x)
+    gap = found.normal - up
+    a, b = np.einsum("ij,ij->i", gap, x), np.einsum("ij,ij->i", gap, y)
+    xx, xy, yy = 1 - depth * found.bend[:, 0], -depth * found.bend[:, 1], 1 - depth * found.bend[:, 2]
+    area = xx * yy - xy**2
+    # Below the axis of curvature there is no foot.
+    known = (area > _LEAST_AREA) & (xx > 0)
+    area = np.where(known, area, 1.0)
+    a, b = (yy * a - xy * b) / area, (xx * b - xy * a) / area
+    moved = up + np.where(known[:, None], a[:, None] * x + b[:, None] * y, 0)
+    return np.asarray(moved / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-30))
 
 
 @final
@@ -156,6 +205,10 @@ class Sphere(Shape):
             alike([1.0, 0.0, 1.0], len(point)),
         )  # fmt: skip
 
+    def foot(self, point: Floats, up: Floats) -> Foot:
+        away = np.linalg.norm(point, axis=1)
+        return Foot(self.surface(point, up, met_once(np.zeros(len(point)))).uv, 1 - away)
+
 
 @final
 class Cylinder(Shape):
@@ -189,6 +242,10 @@ class Cylinder(Shape):
         du = np.stack([cos, 0 * sin, -sin], axis=1) * self.tile
         dv = alike([0.0, -self._tile_height, 0.0], len(point))
         return exact(point, normal, uv, du, dv, alike([1.0, 0.0, 0.0], len(point)))
+
+    def foot(self, point: Floats, up: Floats) -> Foot:
+        away = np.hypot(point[:, 0], point[:, 2])
+        return Foot(self.surface(point, up, met_once(np.zeros(len(point)))).uv, 1 - away)
 
 
 def met_once(distance: Floats) -> Meeting:

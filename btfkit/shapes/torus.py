@@ -6,7 +6,7 @@ from typing import ClassVar, final
 
 import numpy as np
 
-from btfkit.shapes.closed import Floats, Meeting, Shape, Surface, exact, met_once, nearest
+from btfkit.shapes.closed import Floats, Foot, Meeting, Shape, Surface, exact, met_once, nearest
 
 # Halvings alone bring any bracket of length 2 below what counts as resolved in that many steps.
 _STEPS, _RESOLVED = 48, 1e-14
@@ -76,6 +76,11 @@ class Torus(Shape):
         dv = south * (2 * np.pi * self._tube / self._across)
         bend = np.stack([cos / from_axis, flat, flat + 1 / self._tube], axis=1)
         return exact(point, normal, np.stack([u, v], axis=1) + 0.5, du, dv, bend)
+
+    def foot(self, point: Floats, up: Floats) -> Foot:
+        from_axis = np.hypot(point[:, 0], point[:, 1])
+        depth = self._tube - np.hypot(from_axis - self._ring, point[:, 2])
+        return Foot(self.surface(point, up, met_once(np.zeros(len(point)))).uv, depth)
 
 
 def _quartic(p: Floats, q: Floats, c: Floats, reach: Floats) -> Floats:

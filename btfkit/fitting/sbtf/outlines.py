@@ -169,7 +169,7 @@ def moved(
     """
     rays = bent.rays_of(found, view, curvature, aspect)
     open_ = np.flatnonzero(~rays.reaches)
-    rays = bent.Rays(*(part[open_] for part in rays))
+    rays = bent.Rays(*(part[open_] for part in rays if part is not None))
     uv, passes = uv[open_], passes[open_]
     closest, place = np.full(len(open_), np.inf, found.heights.dtype), uv.copy()
     for k in range(1, _LOOKS):

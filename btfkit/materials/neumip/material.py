@@ -73,7 +73,9 @@ class NeuMIPMaterial(Material):
     def _keeps_views(self) -> bool:
         return self._kernel is not None and self.spec.output != "released"
 
-    def _answer_lights(self, query: Query) -> tuple[Array, Array | None]:
+    def _answer_lights(
+        self, query: Query, drift: Array | None = None
+    ) -> tuple[Array, Array | None]:
         assert self._kernel is not None
         parts = (query.uv, query.light, query.view, self._footprint(query))
         return self._kernel.evaluate_lights(self.flat, self.texels, *parts), None

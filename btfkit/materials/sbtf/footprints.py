@@ -32,19 +32,21 @@ def offsets(count: int = RAYS) -> NDArray[np.float64]:
 
 def softened(
     query: Query,
+    drift: Array | None,
     rows: NDArray[np.intp],
     grid: tuple[int, int],
-    ask: Callable[[Query], tuple[Array, Array]],
+    ask: Callable[[Query, Array | None], tuple[Array, Array]],
 ) -> tuple[Array, Array]:
     """Answers (..., b, c) and opacity (b,), of some rows as means over their footprints.
 
     Args:
         query: flat; its light (b, 3), or lights (m, 3) or (m, b, 3) that views share.
+        drift: (b, 4) of its rays, or None.
         rows: of footprints, wider than that of a texel, that rays may pass in part.
         grid: (h, w) that footprints count in.
-        ask: what a query with rays of no width answers.
+        ask: what a query with rays of no width answers, and their drift.
     """
-    rgb, opacity = ask(query)
+    rgb, opacity = ask(query, drift)
     if not len(rows):
         return rgb, opacity
     shared = rgb.ndim == 3 and query.light.ndim == 2
@@ -53,13 +55,14 @@ def softened(
         query.uv[rows], np.ascontiguousarray(light), query.view[rows], query.footprint[rows],
         query.curvature[rows],
     )  # fmt: skip
+    off = None if drift is None else np.ascontiguousarray(drift[rows])
     # What a texel's own footprint does not hold, as levels of textures are blurred.
     wide = np.minimum(part.footprint.astype(float), _WIDEST * max(grid))
     spread = np.sqrt(wide**2 - 0.25)[:, None] / np.array(grid[::-1])
     total, stopped = np.zeros((*rgb.shape[:-2], len(rows), rgb.shape[-1])), np.zeros(len(rows))
     for offset in offsets():
         moved = (part.uv + spread * offset).astype(part.uv.dtype)
-        colour, solid = ask(part._replace(uv=moved))
+        colour, solid = ask(part._replace(uv=moved), off)
         total += colour * solid[:, None]
         stopped += solid
     rgb, opacity = rgb.copy(), opacity.copy()

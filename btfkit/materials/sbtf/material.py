@@ -47,6 +47,7 @@ class SBTF(NeuMIPMaterial):
 
     model: ClassVar[str] = "sbtf"
     has_curvature: ClassVar[bool] = True
+    has_drift: ClassVar[bool] = True
     full_sphere: ClassVar[bool] = True
 
     def __init__(self, spec: NeuMIPSpec, weights: Mapping[str, NDArray[Any]], header: Header):
@@ -62,13 +63,23 @@ class SBTF(NeuMIPMaterial):
         self.sharpest = bent.sharpest(found)
 
     def _answer(self, query: Query) -> tuple[Array, Array | None]:
-        return softened(query, self._may_pass(query), self.header.grid, self._answer_sharp)
+        rows = self._may_pass(query)
+        return softened(query, None, rows, self.header.grid, self._answer_sharp)
 
-    def _answer_lights(self, query: Query) -> tuple[Array, Array | None]:
-        return softened(query, self._may_pass(query), self.header.grid, self._answer_lights_sharp)
+    def _answer_along(self, query: Query, drift: Array) -> tuple[Array, Array | None]:
+        rows = self._may_pass(query)
+        return softened(query, drift, rows, self.header.grid, self._answer_sharp)
+
+    def _answer_lights(
+        self, query: Query, drift: Array | None = None
+    ) -> tuple[Array, Array | None]:
+        rows = self._may_pass(query)
+        return softened(query, drift, rows, self.header.grid, self._answer_lights_sharp)
 
     def _may_pass(self, query: Query) -> NDArray[np.intp]:
         """Rows whose footprint is wider than a texel and of which a part may pass."""
+        if query.footprint.strides == (0,) and not query.footprint[:1] > _SHARP:
+            return np.zeros(0, np.intp)
         wide = np.flatnonzero(query.footprint > _SHARP)
         if not len(wide) or self.spec.holes:
             return wide
@@ -78,35 +89,45 @@ class SBTF(NeuMIPMaterial):
         rays = bent.rays_of(self._depth, query.view[wide], bend[wide], self.header.aspect)
         return np.asarray(wide[~rays.reaches], np.intp)
 
-    def _answer_sharp(self, query: Query) -> tuple[Array, Array]:
+    def _answer_sharp(self, query: Query, drift: Array | None) -> tuple[Array, Array]:
         bend, footprint = self._bend(query), self._footprint(query)
         parts = (query.uv, query.light, query.view, footprint, bend)
         if self._kernel is None:
-            answer, found = plain.answer(self._program, *parts)
+            answer, found = plain.answer(self._program, *parts, drift)
             opacity = np.ones(len(answer), np.float32) if found is None else found
         else:
             opacity = np.empty(len(query.uv), np.float32)
-            answer = self._kernel.evaluate(self.flat, self.texels, *parts, opacity=opacity)
+            answer = self._kernel.evaluate(
+                self.flat, self.texels, *parts, opacity=opacity, drift=drift
+            )
         return answer.astype(np.float32, copy=False), opacity.astype(np.float32, copy=False)
 
-    def _answer_lights_sharp(self, query: Query) -> tuple[Array, Array]:
+    def _answer_lights_sharp(self, query: Query, drift: Array | None) -> tuple[Array, Array]:
         assert self._kernel is not None
         bend, opacity = self._bend(query), np.empty(len(query.uv), np.float32)
         parts = (query.uv, query.light, query.view, self._footprint(query), bend)
-        answer = self._kernel.evaluate_lights(self.flat, self.texels, *parts, opacity=opacity)
+        answer = self._kernel.evaluate_lights(
+            self.flat, self.texels, *parts, opacity=opacity, drift=drift
+        )
         return answer, opacity
 
     def _bend(self, query: Query) -> Array | None:
         """Curvature (b,); None, which the plane's rays take, where there is none."""
-        if not np.any(query.curvature):
+        bend = np.ascontiguousarray(query.curvature, np.float32)
+        if not len(bend):
+            return None
+        ends = float(bend.min()), float(bend.max())
+        if ends == (0, 0):
             return None
         low, high = self.sharpest
-        self._warn_of_sharp(query.curvature, low, high)
-        return np.ascontiguousarray(np.clip(query.curvature, low, high), np.float32)
+        if ends[0] >= low and ends[1] <= high:
+            return bend
+        self._warn_of_sharp(ends)
+        return np.clip(bend, low, high).astype(np.float32, copy=False)
 
-    def _warn_of_sharp(self, curvature: Array, low: float, high: float) -> None:
-        ends = float(curvature.min()), float(curvature.max())
-        if (ends[0] < low or ends[1] > high) and "sharp" not in self._warned:
+    def _warn_of_sharp(self, ends: tuple[float, float]) -> None:
+        if "sharp" not in self._warned:
+            low, high = self.sharpest
             self._warned.add("sharp")
             worst, most = (ends[1], high) if ends[1] > high else (ends[0], low)
             warnings.warn(

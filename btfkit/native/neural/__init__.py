@@ -58,15 +58,18 @@ class Kernel:
         *,
         raw: bool = False,
         opacity: Array | None = None,
+        drift: Array | None = None,
     ) -> Array:
-        """As `evaluate_plain`; every array float32 and contiguous.
+        """As `plain.answer`; every array float32 and contiguous.
 
         Args:
+            drift: (b, 4) of rays that `curvature` bends, None for 0 throughout.
+            raw: whether the decoder's numbers are given instead.
             opacity: (b,) to be written, of curved heights; None where it is not asked for.
         """
         outputs = self._layout.decoder.widths[-1] if raw else self._layout.channels
         rgb = np.empty((len(uv), outputs), np.float32)
-        parts = (weights, texels, uv, light, view, footprint, curvature, rgb, opacity)
+        parts = (weights, texels, uv, light, view, footprint, curvature, drift, rgb, opacity)
         self._model.evaluate(*parts, _OWN, raw, self._threads, self._variant)
         return rgb
 
@@ -81,17 +84,19 @@ class Kernel:
         curvature: Array | None = None,
         *,
         opacity: Array | None = None,
+        drift: Array | None = None,
     ) -> Array:
         """(m, b, c) reflectance of b views under m lights.
 
-        What does not depend on the light is computed once a view; `opacity` as in `evaluate`.
+        What does not depend on the light is computed once a view; `opacity` and `drift` as in
+        `evaluate`.
 
         Args:
             lights: (m, 3) that all views share, or (m, b, 3) of each view; there a vector of zeros
                 is not asked, and answers 0.
         """
         rgb = np.empty((len(lights), len(uv), self._layout.channels), np.float32)
-        parts = (weights, texels, uv, lights, view, footprint, curvature, rgb, opacity)
+        parts = (weights, texels, uv, lights, view, footprint, curvature, drift, rgb, opacity)
         kind = _SHARED if lights.ndim == 2 else _EACH
         self._model.evaluate(*parts, kind, False, self._threads, self._variant)
         return rgb

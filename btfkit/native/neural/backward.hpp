@@ -48,7 +48,7 @@ NEUMIP_TARGET inline void Tile::train(const Batch& b, int64_t at, int valid, int
     const int n = padded(valid);
     set_position(b.uv + 2 * at, b.footprint ? b.footprint + at : nullptr, valid, n);
     set_view(b.view + 3 * at, valid, n);
-    set_curvature(b.curvature ? b.curvature + at : nullptr, valid, n);
+    set_curvature(b.curvature ? b.curvature + at : nullptr, nullptr, valid, n);
     find_features<true>(*this, b, at, valid, n);
     set_light(b.light + 3 * at, valid, n, false);
     if (plan.needs_light())

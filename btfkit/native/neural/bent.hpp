@@ -36,10 +36,10 @@ FN F cosine_of(F q) {
     return p * q + 1.f;
 }
 
-constexpr float kLeastSine = 1e-6f, kLeastBend = 1e-9f, kLeastDepth = 1e-6f;
+constexpr float kLeastSine = 1e-6f, kLeastBend = 1e-9f, kLeastDepth = 1e-6f, kLeastHalf = 1e-6f;
 
 struct Ray {
-    F bend, sine, cosine, share, start, stop;
+    F bend, sine, cosine, share, start, stop, part;
     I reaches;
 
     MEMBER F way_to(float height) const {
@@ -87,9 +87,34 @@ FN Ray ray_of(const Surface& s, F x, F y, F z, F k) {
     r.share = larger(z, all(kLowestCosine)) / flat;
     r.start = r.way_to(top);
     const F turn = smaller(r.cosine, all(1.f));
-    const F leaves = 2.f * turn * arc_over_sine(turn) / select(r.reaches, all(1.f), r.bend);
+    const F through = 2.f * turn * arc_over_sine(turn);
+    const F leaves = through / select(r.reaches, all(1.f), r.bend);
     r.stop = select(r.reaches, r.way_to(bottom), leaves - r.start);
+    r.part = r.bend / larger(through, all(2.f * kLeastHalf));
     return r;
+}
+
+// How rays drift off the circle, by their share of the way through.
+struct Drift {
+    F side0, side1, skew0, skew1, u, v;  // (u, v): in uv for a tile width to the side
+
+    MEMBER F over_way(F x) const { return (1.f - x) * (side0 + side1 * x); }
+    MEMBER F side(F x) const { return x * over_way(x); }
+    MEMBER F scale(F x) const { return 1.f + (x - 0.5f) * (skew0 + skew1 * x); }
+};
+
+// How far rays are above the surface where their way is `way` and the circle's height z.
+template <bool DRIFTS>
+FN F gap_of(const Surface& surface, const Ray& r, const Drift& d, F z, F way, F u, F v, F du, F dv) {
+    u += way * du;
+    v += way * dv;
+    if (DRIFTS) {
+        const F x = way * r.part, side = d.side(x);
+        z *= d.scale(x);
+        u += side * d.u;
+        v += side * d.v;
+    }
+    return surface.gap(z, u, v);
 }
 
 // Share of the way from a gap above the surface to one below it at which there is none.
@@ -100,7 +125,9 @@ FN F between(F gap, F under) {
 
 // Way over the surface where rays first meet it; `opaque` tells those that do. (du, dv) is the
 // step in uv of a unit of way.
-FN F meet_bent(const Surface& surface, const Ray& r, F u, F v, F du, F dv, I& opaque) {
+template <bool DRIFTS>
+FN F meet_bent(const Surface surface, const Ray& r, const Drift& d, F u, F v, F du, F dv,
+               I& opaque) {
     const F size_u = du < all(0.f) ? -du : du, size_v = dv < all(0.f) ? -dv : dv;
     const F length = r.stop - r.start;
     const I sure = surface.opacity ? I{} : r.reaches;  // what it reaches may be a hole
@@ -124,8 +151,9 @@ FN F meet_bent(const Surface& surface, const Ray& r, F u, F v, F du, F dv, I& op
         cosine = r.cosine * cc - r.sine * ss;
     }
     F high = r.start, low = high;
-    F gap = surface.gap(drop / larger(sine, all(1e-9f)), u + high * du, v + high * dv);
+    F gap = gap_of<DRIFTS>(surface, r, d, drop / larger(sine, all(1e-9f)), high, u, v, du, dv);
     F under = gap;
+    F near = high, least = all(INFINITY);  // where a ray passes closest by, and by how much
     I going = ~I{};
     const int most = surface.looks > kLooks ? surface.looks : kLooks;
     for (int k = 1; k <= most; ++k) {
@@ -136,15 +164,39 @@ FN F meet_bent(const Surface& surface, const Ray& r, F u, F v, F du, F dv, I& op
         cosine = cosine * c2 - sine * s2;
         sine = turned;
         const F to = r.start + step * float(k);
-        const F rest = surface.gap(drop / larger(sine, all(1e-9f)), u + to * du, v + to * dv);
+        const F z = drop / larger(sine, all(1e-9f));
+        const F rest = gap_of<DRIFTS>(surface, r, d, z, to, u, v, du, dv);
         low = select(going, to, low);
         under = select(going, rest, under);
         going &= (rest > all(0.f)) & (float(k) < count);
         if (!any_of(going)) break;
+        const I nearer = going & (rest < least);
+        near = select(nearer, to, near);
+        least = select(nearer, rest, least);
+    }
+    const I passes = ~sure & (under > all(0.f)) & (least < all(INFINITY));
+    if (any_of(passes)) {
+        const auto look = [&](F way) NEUMIP_TARGET {
+            return gap_of<DRIFTS>(surface, r, d, r.height_at(way), way, u, v, du, dv);
+        };
+        const F half = step * 0.5f, before = look(near - half), after = look(near + half);
+        const I ahead = after < before;
+        const F side = near + select(ahead, half, -half) * 0.5f, beside = look(side);
+        const auto take = [&](F way, F found, F from, F gap_there) NEUMIP_TARGET {
+            const I hit = passes & (found <= all(0.f));
+            low = select(hit, way, low);
+            under = select(hit, found, under);
+            high = select(hit, from, high);
+            gap = select(hit, gap_there, gap);
+        };
+        // The last counts: what is nearest to the viewer.
+        take(near + half, after, near, least);
+        take(side, beside, select(ahead, near, near - half), select(ahead, least, before));
+        take(near - half, before, near - step, least);
     }
     opaque = sure | (under <= all(0.f));
     const F met = high + (low - high) * between(gap, under);
-    const F rest = surface.gap(r.height_at(met), u + met * du, v + met * dv);
+    const F rest = gap_of<DRIFTS>(surface, r, d, r.height_at(met), met, u, v, du, dv);
     const I above = rest > all(0.f);
     high = select(above, met, high);
     gap = select(above, rest, gap);

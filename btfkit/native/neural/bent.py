@@ -9,6 +9,14 @@ sin t, which is
 
 without cancellation for either sign of k, and for k = 0 the plane's z = -s cot t. All lengths are
 in units of the heights.
+
+Where the surface is no cylinder, four numbers say how a ray through it drifts off that circle.
+With x the share of its way from where it enters to where it would leave, 0 to 1,
+
+    to the side, tile widths:  x (1 - x) (side0 + side1 x)
+    height:                    z (1 + (x - 1/2) (skew0 + skew1 x))
+
+to the right of the way where the tile is seen with u to the right and v down: turned from u to v.
 """
 
 from __future__ import annotations
@@ -40,6 +48,22 @@ _LEAST_SINE = 1e-6
 _LEAST_BEND = 1e-9
 # Depths and heights, units, that a bend is never compared with less than.
 _LEAST_DEPTH = 1e-6
+# Half of the turn on the way through, radians, at least: at a view along the surface it is 0.
+_LEAST_HALF = 1e-6
+
+
+class Drift(NamedTuple):
+    """How b rays drift off their circles, as the head of this file has it.
+
+    Attributes:
+        numbers: (b, 4) side0, side1, skew0, skew1; 0 where the surface is not convex.
+        across: (b, 2) in uv for a tile width to the side.
+        part: (b,) share of the way to where the ray would leave, for a unit of way.
+    """
+
+    numbers: Array
+    across: Array
+    part: Array
 
 
 class Rays(NamedTuple):
@@ -53,6 +77,7 @@ class Rays(NamedTuple):
         share: (b,) ray depth of a unit of way, as `plain.step` counts it.
         start, stop: (b,) way where the march begins and ends.
         reaches: (b,) whether the ray reaches the bottom: it cannot pass.
+        drift: of the rays; None where none drifts.
     """
 
     bend: Array
@@ -63,6 +88,7 @@ class Rays(NamedTuple):
     start: Array
     stop: Array
     reaches: Array
+    drift: Drift | None = None
 
 
 class Crossing(NamedTuple):
@@ -73,34 +99,49 @@ class Crossing(NamedTuple):
         opacity: (b,) 1 where they do, 0 where they pass; there the depth is that of the end.
         way: (b,) over the surface, units of heights.
         turn: (b,) angle at the axis between the entry and there, radians.
+        aside: (b, 2) in uv, beside the way that the depth tells; None where nothing drifts.
     """
 
     depth: Array
     opacity: Array
     way: Array
     turn: Array
+    aside: Array | None
 
 
 def meet(
-    found: Heights, uv: Array, view: Array, curvature: Array, *, aspect: float, wrap: bool
+    found: Heights,
+    uv: Array,
+    view: Array,
+    curvature: Array,
+    *,
+    aspect: float,
+    wrap: bool,
+    drift: Array | None = None,
 ) -> Crossing:
     """Where view rays first meet heights on a curved surface.
 
     A ray that reaches the bottom is looked at a texel apart, or at LOOKS places where it is longer;
     one that may leave again, or meet a hole, CURVED_FINER times as often, or at `found.looks`
-    places. Between two of them the surface is taken as straight, twice.
+    places. Where it passes all of them, three more look around the one that it passes closest by:
+    half a step to both sides, and a quarter to the closer one. Between two of them the surface is
+    taken as straight, twice.
 
     Args:
         found: the heights. uv: (b, 2). view: (b, 3). curvature: (b,) 1/tile width.
+        drift: (b, 4) off the circle, None for none.
     """
     heights = found.heights
     h, w = heights.shape
-    rays = rays_of(found, view, curvature, aspect)
+    rays = rays_of(found, view, curvature, aspect, drift)
     # Where there are holes the ray may pass although it reaches the bottom.
     sure = rays.reaches & (found.opacity is None)
 
     def above(way: Array) -> Array:
-        return gap_over(found, uv + way[:, None] * rays.along, height_at(rays, way), wrap=wrap)
+        place = uv + way[:, None] * rays.along
+        if rays.drift is not None:
+            place = place + aside(rays.drift, way)
+        return gap_over(found, place, height_at(rays, way), wrap=wrap)
 
     def met(high: Array, low: Array, gap: Array, under: Array) -> Array:
         return high + (low - high) * np.clip(gap / np.maximum(gap - under, 1e-12), 0, 1)
@@ -112,12 +153,32 @@ def meet(
     low = high = rays.start
     under = gap = above(low)
     going = np.ones(len(uv), bool)
+    near, least = rays.start, np.full(len(uv), np.inf, length.dtype)
     for k in range(1, max(found.looks, LOOKS) + 1):
         high, gap = np.where(going, low, high), np.where(going, under, gap)
         to = rays.start + length * np.minimum(k / count, 1).astype(length.dtype)
         rest = above(to)
         low, under = np.where(going, to, low), np.where(going, rest, under)
         going &= (rest > 0) & (k < count)
+        nearer = going & (rest < least)
+        near, least = np.where(nearer, to, near), np.where(nearer, rest, least)
+    passes = ~sure & (under > 0) & np.isfinite(least)
+    half = length / count / 2
+    before, after = above(near - half), above(near + half)
+    side = np.where(after < before, half, -half) / 2
+    beside = above(near + side)
+    for found_at, gap_at, from_, gap_from in (
+        # The last counts: what is nearest to the viewer.
+        (near + half, after, near, least),
+        (
+            near + side, beside, np.where(side > 0, near, near - half),
+            np.where(side > 0, least, before),
+        ),
+        (near - half, before, near - 2 * half, least),
+    ):  # fmt: skip
+        hit = passes & (gap_at <= 0)
+        low, under = np.where(hit, found_at, low), np.where(hit, gap_at, under)
+        high, gap = np.where(hit, from_, high), np.where(hit, gap_from, gap)
     opaque = sure | (under <= 0)
     first = met(high, low, gap, under)
     rest = above(first)
@@ -127,7 +188,8 @@ def meet(
     way = met(high, low, gap, under)
     way = np.where(opaque, way, rays.stop)
     depth = -way * rays.share * np.asarray(found.scale, way.dtype)
-    return Crossing(depth, opaque.astype(way.dtype), way, rays.bend * way)
+    beside = None if rays.drift is None else aside(rays.drift, way)
+    return Crossing(depth, opaque.astype(way.dtype), way, rays.bend * way, beside)
 
 
 def gap_over(found: Heights, uv: Array, height: Array, *, wrap: bool) -> Array:
@@ -153,8 +215,10 @@ def sharpest(found: Heights) -> tuple[float, float]:
     return -MOST_BEND / top if top else -np.inf, MOST_BEND / -bottom if bottom else np.inf
 
 
-def rays_of(found: Heights, view: Array, curvature: Array, aspect: float) -> Rays:
-    """The rays of some views (b, 3) under curvatures (b,), 1/tile width."""
+def rays_of(
+    found: Heights, view: Array, curvature: Array, aspect: float, drift: Array | None = None
+) -> Rays:
+    """The rays of some views (b, 3) under curvatures (b,), 1/tile width, and drifts (b, 4)."""
     top, bottom = max(float(found.heights.max()), 0.0), min(float(found.heights.min()), 0.0)
     bend = limited(curvature * found.scale, top, bottom).astype(view.dtype)
     z, square = view[:, 2], view[:, 0] ** 2 + view[:, 1] ** 2
@@ -164,11 +228,17 @@ def rays_of(found: Heights, view: Array, curvature: Array, aspect: float) -> Ray
     length = np.hypot(flat, cosine)
     sine, cosine = flat / length, cosine / length
     start = _way_to(top, bend, sine, cosine)
-    leaves = 2 * np.arcsin(np.minimum(cosine, 1)) / np.where(reaches, 1, bend) - start
+    half = np.arcsin(np.minimum(cosine, 1))
+    leaves = 2 * half / np.where(reaches, 1, bend) - start
     stop = np.where(reaches, _way_to(bottom, bend, sine, cosine), leaves)
     moves = displacement(-view[:, 0], -view[:, 1], flat / found.scale, aspect)
     share = np.maximum(z, LOWEST_COSINE) / flat
-    return Rays(bend, sine, cosine, np.stack(moves, axis=1), share, start, stop, reaches)
+    rays = Rays(bend, sine, cosine, np.stack(moves, axis=1), share, start, stop, reaches)
+    if drift is None:
+        return rays
+    numbers = np.where(bend[:, None] > 0, drift, 0).astype(view.dtype)
+    across = np.stack(displacement(-view[:, 1], view[:, 0], flat, aspect), axis=1)
+    return rays._replace(drift=Drift(numbers, across, bend / (2 * np.maximum(half, _LEAST_HALF))))
 
 
 def limited(bend: Array, top: float, bottom: float) -> Array:
@@ -185,7 +255,17 @@ def height_at(rays: Rays, way: Array) -> Array:
     sinc = np.where(np.abs(half) < 1e-4, 1, sine / np.where(np.abs(half) < 1e-4, 1, half))
     middle = rays.cosine * cosine - rays.sine * sine
     end = rays.sine * (cosine**2 - sine**2) + rays.cosine * 2 * sine * cosine
-    return -way * sinc * middle / np.maximum(end, 1e-9)
+    height = -way * sinc * middle / np.maximum(end, 1e-9)
+    if rays.drift is None:
+        return height
+    x, skew = way * rays.drift.part, rays.drift.numbers[:, 2:]
+    return np.asarray(height * (1 + (x - 0.5) * (skew[:, 0] + skew[:, 1] * x)))
+
+
+def aside(drift: Drift, way: Array) -> Array:
+    """How far (b, 2), uv, rays are beside the straight way there."""
+    x, side = way * drift.part, drift.numbers
+    return (x * (1 - x) * (side[:, 0] + side[:, 1] * x))[:, None] * drift.across
 
 
 def falling(rays: Rays, way: Array) -> Array:

@@ -11,12 +11,26 @@ FN void gathered_pair(const float* p, I at, F& left, F& right) {
     left = (F)_mm512_permutex2var_ps(low, even, high);
     right = (F)_mm512_permutex2var_ps(low, _mm512_or_si512(even, _mm512_set1_epi32(1)), high);
 }
+// Upper and lower halves of the 64 bits at `at`.
+FN void gathered_halves(const uint64_t* p, I at, I& upper, I& lower) {
+    const __m512i i = (__m512i)at;
+    const __m512i low = _mm512_i32gather_epi64(_mm512_castsi512_si256(i), p, 8);
+    const __m512i high = _mm512_i32gather_epi64(_mm512_extracti64x4_epi64(i, 1), p, 8);
+    const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+    lower = (I)_mm512_permutex2var_epi32(low, even, high);
+    upper = (I)_mm512_permutex2var_epi32(low, _mm512_or_si512(even, _mm512_set1_epi32(1)), high);
+}
 FN bool any_of(I mask) { return _mm512_movepi32_mask((__m512i)mask) != 0; }
 #elif NEUMIP_LANES == 8
 FN F gathered(const float* p, I at) { return (F)_mm256_i32gather_ps(p, (__m256i)at, 4); }
 FN void gathered_pair(const float* p, I at, F& left, F& right) {
     left = gathered(p, at);
     right = gathered(p, at + 1);
+}
+FN void gathered_halves(const uint64_t* p, I at, I& upper, I& lower) {
+    const int* q = reinterpret_cast<const int*>(p);
+    lower = (I)_mm256_i32gather_epi32(q, (__m256i)at, 8);
+    upper = (I)_mm256_i32gather_epi32(q + 1, (__m256i)at, 8);
 }
 FN bool any_of(I mask) { return _mm256_movemask_ps((__m256)mask) != 0; }
 #else
@@ -28,6 +42,12 @@ FN F gathered(const float* p, I at) {
 FN void gathered_pair(const float* p, I at, F& left, F& right) {
     left = gathered(p, at);
     right = gathered(p, at + 1);
+}
+FN void gathered_halves(const uint64_t* p, I at, I& upper, I& lower) {
+    for (int i = 0; i < L; ++i) {
+        lower[i] = int32_t(p[at[i]]);
+        upper[i] = int32_t(p[at[i]] >> 32);
+    }
 }
 FN bool any_of(I mask) {
     int32_t some = 0;
@@ -42,6 +62,7 @@ struct Surface {
     bool wrap;
     const float* opacity;  // of the heights, or null
     int looks;             // at most along a ray that may pass
+    const uint64_t *quads, *cover_quads;  // the same as `Quads`, or null
 
     MEMBER Corners around(F u, F v) const {
         return corners_of(u, v, all(w), all(h), I{}, wrap);
@@ -49,12 +70,57 @@ struct Surface {
     MEMBER F at(F u, F v) const { return read(heights, around(u, v)); }
     // How far a height z lies above what there is; in holes there is nothing.
     MEMBER F gap(F z, F u, F v) const {
-        const Corners c = around(u, v);
-        const F above = z - read(heights, c);
+        F height, cover;
+        if (quads) {
+            F fx, fy;
+            const I at = quad_at(u, v, fx, fy);
+            height = bottom + (top - bottom) / kQuadMost * read_quad(quads, at, fx, fy);
+            if (opacity) cover = 1.f / kQuadMost * read_quad(cover_quads, at, fx, fy);
+        } else {
+            const Corners c = around(u, v);
+            height = read(heights, c);
+            if (opacity) cover = read(opacity, c);
+        }
+        const F above = z - height;
         if (!opacity) return above;
         const float range = (top > 0.f ? top : 0.f) - (bottom < 0.f ? bottom : 0.f);
         const float rise = range > kLeastRange ? range : kLeastRange;
-        return larger(above - kSlack * rise, (0.5f - read(opacity, c)) * rise);
+        return larger(above - kSlack * rise, (0.5f - cover) * rise);
+    }
+    // Which quad a place is in, and where: the first row and column lie before the texture.
+    MEMBER I quad_at(F u, F v, F& fx, F& fy) const {
+        F x = u, y = v;
+        if (wrap) {
+            x -= floor_of(x);
+            y -= floor_of(y);
+        }
+        // Quads begin a texel before the texture.
+        x = x * w + 0.5f;
+        y = y * h + 0.5f;
+        if (!wrap) {
+            x = smaller(larger(x, all(0.f)), all(w));
+            y = smaller(larger(y, all(0.f)), all(h));
+        }
+        const F x0 = floor_of(x), y0 = floor_of(y);
+        fx = x - x0;
+        fy = y - y0;
+        const I at = __builtin_convertvector(y0, I) * (int32_t(w) + 1) + __builtin_convertvector(x0, I);
+        // No index leaves the quads, whatever is no number.
+        typedef uint32_t U __attribute__((vector_size(sizeof(I)), may_alias));
+        const U last = U{} + uint32_t((int32_t(w) + 1) * (int32_t(h) + 1) - 1);
+        return (I)((U)at < last ? (U)at : last);
+    }
+    // 0 to kQuadMost.
+    MEMBER F read_quad(const uint64_t* from, I at, F fx, F fy) const {
+        I upper, lower;
+        gathered_halves(from, at, upper, lower);
+        typedef uint32_t U __attribute__((vector_size(sizeof(I)), may_alias));
+        const F a = __builtin_convertvector(lower & 0xffff, F);
+        const F b = __builtin_convertvector((I)((U)lower >> 16), F);
+        const F c = __builtin_convertvector(upper & 0xffff, F);
+        const F d = __builtin_convertvector((I)((U)upper >> 16), F);
+        const F first = a + (b - a) * fx, second = c + (d - c) * fx;
+        return first + (second - first) * fy;
     }
     MEMBER F read(const float* from, const Corners& c) const {
         F h[4];

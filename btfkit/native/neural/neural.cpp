@@ -171,7 +171,8 @@ class Model {
     Model(const Model&) = delete;
     Model& operator=(const Model&) = delete;
 
-    // Promises that the texels stay as they are: their range is not looked up again.
+    // Promises that the texels stay as they are: their range is not looked up again, and marches
+    // over curved heights read them as quads.
     void freeze(In<float> t) {
         require(int64_t(t.size()) == texels() * kChannels, "size of the texels");
         frozen_ = false;
@@ -180,15 +181,23 @@ class Model {
         top_ = b.top;
         bottom_ = b.bottom;
         frozen_ = true;
+        if (!plan_.curved) return;
+        const int h = plan_.heights.h, w = plan_.heights.w;
+        quads_ = quads_of(t.data(), h, w, plan_.wrap, bottom_, top_);
+        if (!plan_.holes) return;
+        const float* cover = t.data() + plan_.plane() * kChannels;
+        cover_quads_ = quads_of(cover, h, w, plan_.wrap, 0.f, 1.f);
     }
 
     int64_t weights() const { return int64_t(plan_.weights()); }
     int64_t texels() const { return plan_.texels(); }
 
     void evaluate(In<float> w, In<float> t, In<float> uv, In<float> light, In<float> view,
-                  nb::object footprint, nb::object curvature, Out<float> rgb, nb::object opacity,
-                  int lit, bool raw, int threads, const std::string& name) const {
+                  nb::object footprint, nb::object curvature, nb::object drift, Out<float> rgb,
+                  nb::object opacity, int lit, bool raw, int threads,
+                  const std::string& name) const {
         Batch b = batch(w, t, uv, view, footprint, curvature);
+        if (!drift.is_none()) b.drift = floats(drift, 4 * b.size, "four numbers of drift a query");
         const int64_t outputs = raw ? plan_.decoder.widths.back() : plan_.channels;
         // One light a query, lights that all share, or several of each query's own.
         const bool shared = lit == kShared, each = lit == kEach;
@@ -361,6 +370,8 @@ class Model {
         if (frozen_) {
             b.top = top_;
             b.bottom = bottom_;
+            b.quads = quads_.empty() ? nullptr : quads_.data();
+            b.cover_quads = cover_quads_.empty() ? nullptr : cover_quads_.data();
             return;
         }
         float top = -INFINITY, bottom = INFINITY;
@@ -382,6 +393,7 @@ class Model {
     Plan plan_;
     bool frozen_ = false;
     float top_ = 0, bottom_ = 0;
+    std::vector<uint64_t> quads_, cover_quads_;
     std::vector<std::vector<float>> weights_;
     std::vector<Zeros> texels_;
     std::vector<std::vector<uint8_t>> touched_;
@@ -395,8 +407,8 @@ NB_MODULE(_neural, m) {
         .def_prop_ro("weights", &Model::weights)
         .def_prop_ro("texels", &Model::texels)
         .def("evaluate", &Model::evaluate, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
-             nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg().none(), nb::arg(), nb::arg(),
-             nb::arg(), nb::arg())
+             nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg().none(),
+             nb::arg(), nb::arg(), nb::arg(), nb::arg())
         .def("freeze", &Model::freeze)
         .def("depths", &Model::depths, nb::arg(), nb::arg(), nb::arg(), nb::arg(),
              nb::arg().none(), nb::arg(), nb::arg(), nb::arg())

@@ -45,6 +45,7 @@ def answer(
     view: Array,
     footprint: Array | None = None,
     curvature: Array | None = None,
+    drift: Array | None = None,
 ) -> tuple[Array, Array]:
     """Reflectance (b, c) and opacity (b,) of flat queries.
 
@@ -53,10 +54,13 @@ def answer(
         uv: (b, 2) in 0..1. light, view: (b, 3) unit vectors above the horizon.
         footprint: (b,) texels of the data's grid; None is 0.5 throughout.
         curvature: (b,) 1/tile width; None is the plane.
+        drift: (b, 4) of rays that curvature bends, as `bent` has it; None is 0 throughout.
     """
     if program.cover is not None:
         return _covered(program, program.cover, uv, light, view, footprint, curvature)
-    raw, scaled, (opacity, lit) = _last_layer(program, uv, light, view, footprint, curvature)
+    raw, scaled, (opacity, lit) = _last_layer(
+        program, uv, light, view, footprint, curvature, drift
+    )
     heads = _heads(program, raw)
     if "opacity" in heads:
         opacity = _sigmoid(heads["opacity"][:, 0])
@@ -130,24 +134,38 @@ def marched(
     program: Program, uv: Array, view: Array, curvature: Array | None = None
 ) -> tuple[Array, Array, Array]:
     """Ray depth (b,) as `depths`, opacity (b,) and turn (b,) as `bent.Crossing` has them."""
+    return _ended(program, uv, view, curvature, None)[:3]
+
+
+def _ended(
+    program: Program, uv: Array, view: Array, curvature: Array | None, drift: Array | None
+) -> tuple[Array, Array, Array, Array | None]:
+    """`marched`, and how far rays are aside there, as `bent.Crossing` has it."""
     found, dtype = program.depth, program.textures[0].levels[0].dtype
     opacity, turn = np.ones(len(uv), dtype), np.zeros(len(uv), dtype)
     if found is None or isinstance(found, OffsetNetwork):
-        return np.zeros(len(uv), dtype), opacity, turn
+        return np.zeros(len(uv), dtype), opacity, turn, None
     if isinstance(found, DepthNetwork):
-        return _looked_up(program, found, uv, view, None)[:, 0] * found.scale, opacity, turn
+        return _looked_up(program, found, uv, view, None)[:, 0] * found.scale, opacity, turn, None
     if found.opacity is not None:
         bend = np.zeros(len(uv), dtype) if curvature is None else curvature
-        end = bent.meet(found, uv, view, bend, aspect=program.aspect, wrap=program.wrap)
-        return end.depth, end.opacity, end.turn
+        end = bent.meet(
+            found, uv, view, bend, aspect=program.aspect, wrap=program.wrap, drift=drift
+        )
+        return end.depth, end.opacity, end.turn, end.aside
     along = ray(view, program.aspect, found.scale)
     met = crossing(found.heights, uv, along, wrap=program.wrap)
     depth = met * lift(view) * found.scale
+    aside = None if drift is None else np.zeros_like(uv)
     if found.curved and curvature is not None and (rows := np.flatnonzero(curvature)).size:
-        depth[rows], opacity[rows], _, turn[rows] = bent.meet(
-            found, uv[rows], view[rows], curvature[rows], aspect=program.aspect, wrap=program.wrap
-        )
-    return depth, opacity, turn
+        end = bent.meet(
+            found, uv[rows], view[rows], curvature[rows], aspect=program.aspect,
+            wrap=program.wrap, drift=None if drift is None else drift[rows],
+        )  # fmt: skip
+        depth[rows], opacity[rows], turn[rows] = end.depth, end.opacity, end.turn
+        if aside is not None:
+            aside[rows] = end.aside
+    return depth, opacity, turn, aside
 
 
 def _looked_up(
@@ -303,12 +321,13 @@ def _last_layer(
     view: Array,
     footprint: Array | None,
     curvature: Array | None,
+    drift: Array | None = None,
 ) -> tuple[Array, Array | None, tuple[Array, Array]]:
     """The last layer's numbers, what the scaling texture says there, and the march's opacity.
 
     With the opacity (b,) it says whether light comes from above where the ray ends, (b,).
     """
-    depth, opacity, turn = marched(program, uv, view, curvature)
+    depth, opacity, turn, aside = _ended(program, uv, view, curvature, drift)
     toward, away = step(view, program.aspect), step(light, program.aspect)
     if isinstance(program.depth, OffsetNetwork):
         offset = _looked_up(program, program.depth, uv, view, curvature)
@@ -325,6 +344,8 @@ def _last_layer(
             moved = uv + texture.view * offset
         elif program.depth is not None and (texture.view or texture.light):
             moved = uv + depth[:, None] * (texture.view * toward - texture.light * away)
+            if aside is not None:
+                moved = moved + texture.view * aside
         values.append(_between_levels(texture, moved, known["level"] * LEVELS_UNIT, program.wrap))
     for texture, found in zip(program.textures, values, strict=False):
         known |= _columns(texture, found)

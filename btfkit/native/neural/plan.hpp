@@ -152,12 +152,36 @@ inline void check(const Plan& plan) {
 }
 
 // Where a batch lies; null where a part is absent. Vectors are rows of 2, 3 or c floats.
+constexpr float kQuadMost = 65535.f;
+
+// A plane of numbers for marches, which look at many: the four around each place, 16 bits each of
+// the way from the least to the greatest, side by side. One row and one column come before it, for
+// places between the last and the first, or before the first.
+inline std::vector<uint64_t> quads_of(const float* from, int h, int w, bool wrap, float low, float high) {
+    std::vector<uint64_t> found(size_t(h + 1) * (w + 1));
+    const float scale = high > low ? kQuadMost / (high - low) : 0.f;
+    const auto at = [&](int y, int x) {
+        y = wrap ? (y + h) % h : std::clamp(y, 0, h - 1);
+        x = wrap ? (x + w) % w : std::clamp(x, 0, w - 1);
+        const float share = (from[size_t(y) * w + x] - low) * scale;
+        // What is no number counts as the least.
+        return uint64_t(share > 0.f ? std::min(share, kQuadMost) + 0.5f : 0.f);
+    };
+    for (int y = -1; y < h; ++y)
+        for (int x = -1; x < w; ++x)
+            found[size_t(y + 1) * (w + 1) + x + 1] =
+                at(y, x) | at(y, x + 1) << 16 | at(y + 1, x) << 32 | at(y + 1, x + 1) << 48;
+    return found;
+}
+
 struct Batch {
     int64_t size = 0;
     const float *uv = nullptr, *light = nullptr, *view = nullptr, *footprint = nullptr;
     const float *curvature = nullptr;  // 1 / tile width; null is the plane
+    const float *drift = nullptr;      // four a query, of rays that curvature bends; null is 0
     const float *target = nullptr, *weight = nullptr;
     float top = 0, bottom = 0;  // of the heights
+    const uint64_t *quads = nullptr, *cover_quads = nullptr;  // of frozen curved heights, or null
 };
 
 struct Gradient {

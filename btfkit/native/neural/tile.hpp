@@ -11,10 +11,11 @@ struct Tile {
     Levels levels;
     // u v du_view dv_view du_light dv_light depth, of heights the ray, the crossing and its share
     // of the depth, the gradient of the depth, what curvature makes of a ray (the curvature a unit
-    // of heights, the opacity, what scatter_heights takes, the way's direction, the turn); and channels of one bank
+    // of heights, the opacity, what scatter_heights takes, the way's direction, the turn, how it
+    // drifts off a circle); and channels of one bank
     Rows in, slopes;
     Surface surface{};
-    bool bent = false, train_ = false;  // whether the batch has curvatures; whether it is learnt from
+    bool bent = false, drifts = false, train_ = false;  // whether the batch has curvatures, drifts; whether it is learnt from
     alignas(64) float direction[kInputs][kTile];
     alignas(64) float position[2][kTile];
     alignas(64) float gather[kTile][kChannels];
@@ -24,13 +25,14 @@ struct Tile {
     bool fetched = false;
     Feed feed;
     enum { kU, kV, kHu, kHv, kLu, kLv, kDepth, kRayU, kRayV, kLift, kCross, kSlope,
-           kBend, kOpaque, kClear, kLeast, kBackX, kBackY, kTurnSine, kTurnCosine, kInRows };
+           kBend, kOpaque, kClear, kLeast, kBackX, kBackY, kTurnSine, kTurnCosine,
+           kSide0, kSide1, kSkew0, kSkew1, kInRows };
 
     NEUMIP_TARGET Tile(const Plan& p, const float* weights, const float* t, const Batch& b,
                        bool train)
         : plan(p), texels(t), train_(train) {
         surface = {t, float(p.heights.w), float(p.heights.h), b.top, b.bottom, p.wrap,
-                   p.holes ? t + p.plane() * kChannels : nullptr, p.looks};
+                   p.holes ? t + p.plane() * kChannels : nullptr, p.looks, b.quads, b.cover_quads};
         decoder.pack(p.decoder, weights, train, p.half, p.pairs && L == 16);
         decoder_trace.reset(p.decoder, train);
         if (p.offset) {
@@ -107,8 +109,11 @@ struct Tile {
         }
     }
 
-    NEUMIP_TARGET void set_curvature(const float* curvature, int valid, int n) {
+    NEUMIP_TARGET void set_curvature(const float* curvature, const float* drift, int valid, int n) {
         if (!plan.curved) return;
+        drifts = curvature != nullptr && drift != nullptr;
+        for (int c = 0; drifts && c < 4; ++c)
+            for (int i = 0; i < n; ++i) in[kSide0 + c][i] = drift[4 * (i < valid ? i : valid - 1) + c];
         // Rays that may pass a hole are followed as those that may pass an outline.
         bent = curvature != nullptr || plan.holes;
         std::fill(in[kOpaque], in[kOpaque] + n, 1.f);
@@ -184,12 +189,28 @@ struct Tile {
         const F part = -plan.depth_scale / larger(root(x * x + y * y), all(kLeastSine));
         put(kRayU, x * part);
         put(kRayV, y * part * -plan.aspect);
+        const F flat = -1.f / larger(root(x * x + y * y), all(kLeastSine));
         I opaque;
-        const F way = meet_bent(surface, r, load(in[kU] + i), load(in[kV] + i),
-                                load(in[kRayU] + i), load(in[kRayV] + i), opaque);
+        F way;
+        if (drifts) {
+            const I convex = r.bend > all(0.f);
+            const auto part_of = [&](int row) NEUMIP_TARGET {
+                return select(convex, load(in[row] + i), all(0.f));
+            };
+            const Drift d{part_of(kSide0), part_of(kSide1), part_of(kSkew0), part_of(kSkew1),
+                          y * flat, x * flat * plan.aspect};
+            way = meet_bent<true>(surface, r, d, load(in[kU] + i), load(in[kV] + i),
+                                  load(in[kRayU] + i), load(in[kRayV] + i), opaque);
+            // Lookups are moved by the depth: aside, a part of it.
+            const F beside = d.over_way(way * r.part) * r.part / -r.share;
+            put(kHu, load(in[kHu] + i) + beside * d.u);
+            put(kHv, load(in[kHv] + i) + beside * d.v);
+        } else {
+            way = meet_bent<false>(surface, r, Drift{}, load(in[kU] + i), load(in[kV] + i),
+                                   load(in[kRayU] + i), load(in[kRayV] + i), opaque);
+        }
         put(kCross, way);
         put(kDepth, -way * r.share);
-        const F flat = -1.f / larger(root(x * x + y * y), all(kLeastSine));
         store(in[kBackX] + i, x * flat);
         store(in[kBackY] + i, y * flat);
         const F half = r.bend * way * 0.5f, q = half * half, s = half * sinc_of(q);
@@ -366,7 +387,8 @@ struct Tile {
         const int n = padded(valid);
         set_position(b.uv + 2 * at, b.footprint ? b.footprint + at : nullptr, valid, n);
         set_view(b.view + 3 * at, valid, n);
-        set_curvature(b.curvature ? b.curvature + at : nullptr, valid, n);
+        set_curvature(b.curvature ? b.curvature + at : nullptr, b.drift ? b.drift + 4 * at : nullptr,
+                      valid, n);
         find_features<false>(*this, b, at, valid, n);
         fetched = false;
     }
