@@ -141,7 +141,7 @@ def onto_another(
     from btfkit.materials import file
 
     own, other = tiles
-    rows, test = fitting.split(len(own), HOLDOUT, SEED)
+    rows, test = btfkit.split(len(own), HOLDOUT, SEED)
     material, training, found = after(own, model, cpu, seed, **settings)
     if keep is not None:
         file.save(material, keep, training=training, force=True)
@@ -186,7 +186,7 @@ def after(
     from btfkit.fitting.neubtf.encoder import Encoder as HalfResolution
 
     torch.set_num_threads(1)
-    rows, test = fitting.split(len(btf), HOLDOUT, SEED)
+    rows, test = btfkit.split(len(btf), HOLDOUT, SEED)
     trainable, generators = begun(btf, model, rows, test, seed, **settings)
     encoder = getattr(trainable, "encoder", None)
     if model == "neubtf-paper" and isinstance(encoder, HalfResolution):
@@ -229,7 +229,7 @@ def onto_the_rest(model: str, cpu: float, seed: int) -> dict[str, Any]:
     whole = measured_wool()
     _, h, w, _ = whole.shape
     quarter = whole.crop(slice(0, h // 2), slice(0, w // 2))
-    rows, test = fitting.split(len(whole), HOLDOUT, SEED)
+    rows, test = btfkit.split(len(whole), HOLDOUT, SEED)
     pairs = np.random.default_rng(1).permutation(test)[:12]
     material, training, found = after(quarter, model, cpu, seed)
     found["own"] = evaluation.errors_on_btf(material, quarter, pairs=pairs)["psnr_log1p"]
@@ -393,7 +393,7 @@ def spread(btf: BTF, model: Path) -> dict[str, Any]:
     """Held-out error of the material propagated onto slices under other lights and views."""
     from btfkit.propagation import propagate
 
-    _, test = fitting.split(len(btf), HOLDOUT, SEED)
+    _, test = btfkit.split(len(btf), HOLDOUT, SEED)
     rng = np.random.default_rng(SEED)
     pairs = rng.permutation(test)[:24]
     theta = np.degrees(np.arccos(np.clip(btf.view[:, 2], -1, 1)))
@@ -416,7 +416,7 @@ def scales(btf: BTF, model: Path) -> dict[str, Any]:
     from btfkit.fitting.neubtf.data import frontal_slice
     from btfkit.propagation import consistency
 
-    train, _ = fitting.split(len(btf), HOLDOUT, SEED)
+    train, _ = btfkit.split(len(btf), HOLDOUT, SEED)
     guidance = frontal_slice(btf, train).permute(1, 2, 0).numpy()
     return {str(scale): consistency(guidance, model, scale=scale) for scale in (0.75, 0.5, 0.25)}
 
@@ -438,7 +438,7 @@ def against_truth(whole: BTF, crop: BTF, model: Path) -> dict[str, Any]:
     from btfkit.fitting.neubtf.data import frontal_slice
     from btfkit.propagation import propagate
 
-    train, test = fitting.split(len(crop), HOLDOUT, SEED)
+    train, test = btfkit.split(len(crop), HOLDOUT, SEED)
     guidance = frontal_slice(whole, train).permute(1, 2, 0).numpy()
     carried = propagate(guidance, model, wrap="wrap")
     mean = np.zeros(3)

@@ -10,12 +10,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from btfkit import directions
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 Array = NDArray[np.float32]
 Floats = NDArray[Any]
@@ -32,6 +35,8 @@ SAMPLE = 1 << 16
 _GRID = 0.5
 # Pairs of directions at which the covered share is estimated, and the lowest z of them.
 _LOOKS, _LOWEST_Z = 4096, 0.02
+# Distances that are taken one by one, rather than looked up in a tree; and of these at a time.
+_COMPARED, _COMPARED_AT_A_TIME = 1 << 24, 1 << 16
 # Below this uncovered share nothing is said, and nothing is done.
 DENSE = 0.1
 # Directions flatter than this no rig measures, and no data are blamed for.
@@ -259,22 +264,52 @@ class _Spots:
     """Points (n, 3 or 6) on one sphere or two, each with how far it reaches."""
 
     def __init__(self, points: Floats) -> None:
-        # Here, because a material is loaded and answers without it, and it takes half a second.
-        from scipy.spatial import cKDTree
-
-        self._tree = cKDTree(points.astype(float))
+        self._points = points.astype(float)
         k = min(_NEIGHBOURS, len(points) - 1)
         reach = np.full(len(points), _LEAST)
         if k:
-            far, _ = self._tree.query(points, k=[k + 1])
-            reach = np.clip(far[:, 0], _LEAST, _MOST)
+            far, _ = self._nearest(self._points, k + 1)
+            reach = np.clip(far.max(axis=1), _LEAST, _MOST)
         self._reach, self._k = reach, min(4, len(points))
 
     def distance(self, at: Floats) -> Floats:
         """(b,) from the nearest point, in its reach; chords stand for angles."""
-        far, which = self._tree.query(at, k=list(range(1, self._k + 1)))
+        far, which = self._nearest(at, self._k)
         nearest: Floats = (far / self._reach[which]).min(axis=1)
         return nearest
+
+    def _nearest(self, at: Floats, k: int) -> tuple[Floats, NDArray[np.intp]]:
+        """(b, k) how far the k nearest points are, in no order, and which they are."""
+        if len(at) * len(self._points) <= _COMPARED:
+            return compared(at, self._points, k)
+        far, which = self._tree.query(at, k=list(range(1, k + 1)))
+        return far, which
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        # Here, because it takes a third of a second to load, and few questions do without.
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self._points)
+
+
+def compared(at: Floats, points: Floats, k: int) -> tuple[Floats, NDArray[np.intp]]:
+    """(b, k) chords from `at` (b, m) to the k nearest of `points` (n, m), in no order, and which.
+
+    All are looked at; what a tree answers, to 1e-7: squares are differences of unit lengths.
+    """
+    long = np.square(points).sum(axis=1)
+    minus = -2 * points.T
+    far, which = np.empty((len(at), k)), np.empty((len(at), k), np.intp)
+    step = max(_COMPARED_AT_A_TIME // len(points), 1)
+    for first in range(0, len(at), step):
+        rows = slice(first, first + step)
+        square = at[rows] @ minus
+        square += long
+        which[rows] = np.argpartition(square, k - 1, axis=1)[:, :k]
+        near = np.take_along_axis(square, which[rows], axis=1)
+        far[rows] = near + np.square(at[rows]).sum(axis=1, keepdims=True)
+    return np.sqrt(np.maximum(far, 0)), which
 
 
 def _faded(distance: Floats) -> Floats:

@@ -35,13 +35,18 @@ def split(count: int, holdout: float = 0.05, seed: int = 0) -> tuple[Index, Inde
     Raises:
         ValueError: `holdout` outside 0..1, or nothing left to train on.
     """
+    train, test = shared_split(count, holdout, seed)
+    return train.copy(), test.copy()
+
+
+def shared_split(count: int, holdout: float, seed: int) -> tuple[Index, Index]:
+    """As `split`, for who only reads: arrays that cannot be written to, those of the last call."""
     if not 0 <= holdout < 1:
         raise ValueError(f"holdout = {holdout}; expected 0 up to, but not, 1")
     held = 0 if holdout == 0 or count == 1 else max(1, round(holdout * count))
     if held >= count:
         raise ValueError(f"holdout = {holdout} of {count} leaves nothing to train on")
-    train, test = _split(count, held, seed)
-    return train.copy(), test.copy()
+    return _split(count, held, seed)
 
 
 # A fit asks for one and the same split of its millions of rows from several places.
@@ -49,7 +54,10 @@ def split(count: int, holdout: float = 0.05, seed: int = 0) -> tuple[Index, Inde
 def _split(count: int, held: int, seed: int) -> tuple[Index, Index]:
     tested = np.zeros(count, bool)
     tested[np.random.default_rng([seed, 0x5EED]).permutation(count)[:held]] = True
-    return np.flatnonzero(~tested), np.flatnonzero(tested)
+    both = np.flatnonzero(~tested), np.flatnonzero(tested)
+    for rows in both:
+        rows.flags.writeable = False
+    return both
 
 
 def fingerprint(source: BTF | QuerySet) -> dict[str, Any]:

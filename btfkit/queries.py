@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -215,7 +216,11 @@ class QuerySet:
         return f"QuerySet({len(self)} queries{', with ' if known else ''}{', '.join(known)})"
 
     def valid(self) -> NDArray[np.bool_]:
-        """(b,) rows that are finite throughout and not seen from below the horizon."""
+        """(b,) rows that are finite and not seen from below the horizon; read only."""
+        return self._valid
+
+    @cached_property
+    def _valid(self) -> NDArray[np.bool_]:
         with np.errstate(over="ignore", invalid="ignore"):
             keep = self.view[:, 2] >= 0
             for direction in (self.light, self.view):
@@ -225,6 +230,7 @@ class QuerySet:
             # Looking at rows costs ten times what looking at everything does.
             if value is not None and not (finite := np.isfinite(value)).all():
                 keep &= finite.reshape(len(value), -1).all(axis=1)
+        keep.flags.writeable = False
         return keep
 
     def subset(self, rows: NDArray[Any] | slice) -> QuerySet:

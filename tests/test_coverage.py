@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from btfkit import coverage as coverages
 from btfkit import directions
 from btfkit.coverage import Coverage, spread_pairs
 from btfkit.materials import file
@@ -90,6 +91,17 @@ def test_order_and_repetition_of_pairs_do_not_matter() -> None:
     one, other = Coverage.of(light, view), Coverage.of(light[order], view[order])
     # Chords of float32 directions, in parts of a reach of 0.14 at least.
     np.testing.assert_allclose(one.confidence(*asked), other.confidence(*asked), atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["one pair", "flash", "scattered", "bonn81"])
+def test_few_questions_are_answered_as_a_tree_answers_them(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = spread_pairs(300, np.random.default_rng(4))
+    few = Coverage.of(*KINDS[kind]).confidence(*asked)
+    monkeypatch.setattr(coverages, "_COMPARED", 0)
+    # Chords of 1e-7, in parts of a reach of 0.14 at least.
+    np.testing.assert_allclose(Coverage.of(*KINDS[kind]).confidence(*asked), few, atol=1e-5)
 
 
 def test_shapes_broadcast_and_lengths_do_not_matter() -> None:

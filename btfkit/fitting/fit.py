@@ -23,7 +23,7 @@ from btfkit.fitting.reading import masked, read_once
 from btfkit.fitting.report import FitReport
 from btfkit.fitting.saving import report_file, save, state_file
 from btfkit.fitting.training import Plan, Progress, Ran, gpu, solved, trained
-from btfkit.heldout import fingerprint, split
+from btfkit.heldout import fingerprint, shared_split
 from btfkit.materials.base import Material
 from btfkit.materials.evaluation import errors_on_btf, errors_on_queries
 from btfkit.queries import QuerySet
@@ -84,7 +84,7 @@ def fit(
     """
     _check(model, budget_s, steps, device)
     _check_taught(model, source, teacher)
-    split(1, holdout, seed)  # refuses what is no share
+    shared_split(1, holdout, seed)  # refuses what is no share
     final = _out(out, resume=resume, force=force)
     plan = Plan(steps, final, resume, force or resume, seed, holdout, device)
     phases = Phases(budget_s if steps is None else None, phase)
@@ -99,7 +99,7 @@ def fit(
         relief, told = _relief_behind(data, given, plan, budget_s, phases, progress)
         choice = (*choice, told) if told else choice
     if chosen in CLOSED_FORM:
-        train = split(len(data), holdout, seed)[0]
+        train = shared_split(len(data), holdout, seed)[0]
         material, run = solved(data.subset(train), chosen, given, plan, progress)
         if "gains.pairs" in run.training:
             run = replace(run, training={**run.training, "gains.pairs": train})
@@ -244,7 +244,7 @@ def _relief_behind(
     from btfkit.fitting.heightfield.chain import relief_behind
 
     phases.begin("heights")
-    train = data.subset(split(len(data), plan.holdout, plan.seed)[0])
+    train = data.subset(shared_split(len(data), plan.holdout, plan.seed)[0])
     relief, told = relief_behind(
         train, budget_s=None if plan.steps is not None else budget_s, steps=plan.steps,
         seed=plan.seed, progress=progress,
@@ -255,7 +255,7 @@ def _relief_behind(
 
 def _covered(data: BTF | QuerySet, plan: Plan) -> Coverage | None:
     """Which directions the training saw; None where no pair is seen from above."""
-    rows = split(len(data), plan.holdout, plan.seed)[0]
+    rows = shared_split(len(data), plan.holdout, plan.seed)[0]
     if isinstance(data, QuerySet):
         rows = rows[data.valid()[rows]]
     seen = rows[data.view[:, 2][rows] > 0]
@@ -291,7 +291,7 @@ def _errors(
     gains: bool,
 ) -> Mapping[str, Any]:
     """Held-out errors; of a BTF, of as many pairs as there is time for, in random order."""
-    test = split(len(source), plan.holdout, plan.seed)[1]
+    test = shared_split(len(source), plan.holdout, plan.seed)[1]
     if not len(test):
         return {}
     if isinstance(source, QuerySet):
@@ -311,7 +311,7 @@ def _report(
     run: Ran,
     phases: Phases,
 ) -> FitReport:
-    train, test = split(len(source), plan.holdout, plan.seed)
+    train, test = shared_split(len(source), plan.holdout, plan.seed)
     textures = [n for n in material.weights if "texture" in n]
     sizes = {name: array.size for name, array in material.weights.items()}
     return FitReport(

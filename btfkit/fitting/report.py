@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
 
 from btfkit.files import whole
-from btfkit.jsonvalues import plain
+from btfkit.jsonvalues import by_line, plain
 from btfkit.materials.base import Material
 
 
@@ -84,7 +83,7 @@ class FitReport:
     def write(self, path: Path) -> None:
         """Write it as JSON, with the material's header."""
         header = self.material.header.fields()
-        text = json.dumps(plain({**self.as_dict(), "header": header}), indent=1)
+        text = by_line(plain({**self.as_dict(), "header": header}))
         with whole(path, force=True) as partial:
             partial.write_text(text)
 

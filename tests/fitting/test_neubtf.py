@@ -166,6 +166,36 @@ def test_a_quarter_is_kept_from_the_encoder_until_it_has_been_measured(tiny: BTF
     assert begun(small)._kept is None
 
 
+def test_of_a_large_sample_a_part_tells_how_well_is_carried(
+    tiny: BTF, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = begun(tiny)
+    assert model._judged(neubtf.Window(8, 8, 16, 16)) == ((0, 0, 32, 32), (8, 8, 16, 16))
+    monkeypatch.setattr(neubtf, "_MOST_SIDE", 12)
+    part, window = model._judged(neubtf.Window(8, 8, 16, 16))
+    # Beside the kept corner three quarters that the encoder has seen, to be copied from.
+    assert (part, window) == ((2, 2, 12, 12), (8, 8, 6, 6))
+    for progress in (0.0, 0.27, 0.95):
+        model.step(progress)
+    found = model.stated()
+    assert found["carried_window"] == [8, 8, 6, 6]
+    assert math.isfinite(found["psnr_carried"])
+
+
+def test_a_part_of_a_material_answers_as_the_whole_does_there(tiny: BTF) -> None:
+    model = begun(tiny)
+    for index in range(30):
+        model.step(0.2 * index / 30)
+    material = model.free.material()
+    part = carrier.part_of(material, neubtf.Window(4, 6, 24, 20))
+    light, view = [0.3, 0.2, 0.9], [0.0, 0.0, 1.0]
+    all_of_it = material.evaluate(texel_centres(32, 32), light, view).reflectance
+    some = part.evaluate(texel_centres(24, 20), light, view).reflectance
+    # float16 heights of another scale move the places by 2^-11 of them; the border is another one.
+    np.testing.assert_allclose(some[2:-2, 2:-2], all_of_it[6:26, 8:24], atol=2e-3)
+    assert carrier.part_of(material, neubtf.Window(0, 0, 32, 32)) is material
+
+
 def whole(guides: Any) -> Any:
     """The same guides, unmoved."""
     guides._window = lambda: neubtf.Window(0, 0, 32, 32)

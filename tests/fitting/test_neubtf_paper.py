@@ -365,10 +365,10 @@ def test_a_holdout_that_leaves_nothing_is_refused(tiny: BTF, holdout: float) -> 
 def test_training_and_test_pairs_are_disjoint_complete_and_repeatable(
     n: int, share: float, seed: int
 ) -> None:
-    train, test = fit.split(n, share, seed)
+    train, test = btfkit.split(n, share, seed)
     assert sorted([*train, *test]) == list(range(n))
     assert len(test) == max(1, round(share * n))
-    np.testing.assert_array_equal(train, fit.split(n, share, seed)[0])
+    np.testing.assert_array_equal(train, btfkit.split(n, share, seed)[0])
 
 
 def test_the_report_stands_beside_the_model(fitted: Path) -> None:

@@ -15,7 +15,7 @@ from btfkit import metrics
 from btfkit.btf import BTF
 from btfkit.errors import FitError
 from btfkit.fitting.neubtf import augment, unet
-from btfkit.fitting.neubtf.copying import Copier, Mix
+from btfkit.fitting.neubtf.copying import REACH, Copier, Mix
 from btfkit.fitting.neubtf.encoder import STRIDE, Encoder, encode_in_tiles, in_parts
 from btfkit.fitting.neubtf.guides import Window, encode, multiple
 from btfkit.materials.base import Array, Header, Material
@@ -132,37 +132,57 @@ class Carrier:
         """
         if self.mix is None or self.guidance is None:
             return None
+        answer = self.answer(self.guidance, wrap=material.header.wrap == "wrap")
+        return self._copier(material, answer, left_out)
+
+    def _copier(
+        self, material: NeuMIPMaterial, answer: Tensor, left_out: Window | None
+    ) -> Copier | None:
         wrap = material.header.wrap == "wrap"
-        answer = self.answer(self.guidance, wrap=wrap)
         size: tuple[int, int] = (answer.shape[2], answer.shape[3])
         channels = augment.resized(self.standardised(material)[None], size, wrap=wrap)[0]
-        barred = None
-        if left_out is not None:
-            shown = inside(left_out, self.guidance.shape[-2:]).float()[None, None]
-            barred = augment.resized(shown, size, wrap=wrap)[0, 0] > 0
+        barred = None if left_out is None else self._shown(left_out, size, wrap=wrap) > 0
         return Copier.of(self.scaled(answer)[0], channels, wrap=wrap, left_out=barred)
 
-    def mix_of(self, material: NeuMIPMaterial, window: Window, scale: Tensor) -> Mix | None:
-        """How much to copy beside the encoder's answer: what is best where it never saw.
+    def _shown(self, window: Window, size: tuple[int, int], *, wrap: bool) -> Tensor:
+        """(h, w) how much of each texel of an answer of a size lies in a window of the sample."""
+        assert self.guidance is not None
+        shown = inside(window, self.guidance.shape[-2:]).float()[None, None]
+        return augment.resized(shown, size, wrap=wrap)[0, 0]
 
-        None where nothing is left to copy from. `guidance` has to be there.
+    def judged(
+        self, material: NeuBTF, window: Window, scale: Tensor | None
+    ) -> tuple[NeuBTF, Mix | None]:
+        """The sample with a window as if it were another's, and how much to copy there.
 
         Args:
-            material: of the sample. window: of it, kept from the encoder. scale: as in `Mix`.
+            material: of the sample; `guidance` has to be its own.
+            window: kept from the encoder; outside, the answer is the encoder's.
+            scale: as in `Mix`; None copies nothing, as where nothing is left to copy from.
         """
         assert self.guidance is not None
-        wrap = material.header.wrap == "wrap"
-        alone = replace(self, mix=Mix.none(scale))
-        copier = alone.copier(material, window)
-        if copier is None:
-            return None
-        answer = alone.answer(self.guidance, wrap=wrap)
-        copied = in_parts(copier, alone.scaled(answer), wrap=wrap)[0]
+        header, mix, share = material.header, None, 0.0
+        wrap = header.wrap == "wrap"
+        answer = self.answer(self.guidance, wrap=wrap)
         size: tuple[int, int] = (answer.shape[2], answer.shape[3])
-        wanted = augment.resized(self.standardised(material)[None], size, wrap=wrap)[0]
-        shown = inside(window, self.guidance.shape[-2:]).float()[None, None]
-        among = augment.resized(shown, size, wrap=wrap)[0, 0] > 0.5
-        return Mix.measured(answer[0], copied, wanted, among, scale)
+        by = None if scale is None else replace(self, mix=Mix.none(scale))
+        copier = None if by is None else by._copier(material, answer, window)
+        if by is not None and copier is not None and by.mix is not None:
+            wanted = augment.resized(self.standardised(material)[None], size, wrap=wrap)[0]
+            among = self._shown(window, size, wrap=wrap) > 0.5
+            # What lies around the window is looked at, and not asked.
+            at, around, within = _bounds(among)
+            found = in_parts(copier, by.scaled(answer[(..., *around)]), wrap=False, reach=REACH)
+            copied, own = found[(0, ..., *within)], answer[(0, ..., *at)]
+            mix = Mix.measured(own, copied, wanted[(..., *at)], among[at], by.mix.scale)
+            answer[(0, ..., *at)], share = mix(own, copied)
+        return self._made(material, answer, self.guidance, header, share), mix
+
+    def of_part(self, part: Window) -> Carrier:
+        """The same of a part of the sample."""
+        assert self.guidance is not None
+        rows, cols = part.slices()
+        return replace(self, guidance=self.guidance[:, :, rows, cols])
 
     def _is_own(self, guidance: Tensor) -> bool:
         """Whether a guidance is the sample's, up to what other held-out pairs make of its mean."""
@@ -174,27 +194,6 @@ class Carrier:
     def scaled(self, answer: Tensor) -> Tensor:
         """An answer (b, k, h, w) as it is compared."""
         return answer if self.mix is None else answer * self.mix.scale[:, None, None]
-
-    def textures(
-        self, guidance: Tensor, *, wrap: bool, averaged: bool = True, copier: Copier | None = None
-    ) -> tuple[Array, Array, float]:
-        """Heights (h, w) in texels, features (h, w, free + tied), and the share that is copied.
-
-        Args:
-            guidance, wrap, averaged: as in `answer`. copier: the sample; None copies nothing.
-        """
-        h, w = guidance.shape[-2:]
-        answer, copied = self.answer(guidance, wrap=wrap, averaged=averaged), 0.0
-        with torch.no_grad():
-            if copier is not None and self.mix is not None:
-                found = in_parts(copier, self.scaled(answer), wrap=wrap)
-                mixed, copied = self.mix(answer[0], found[0])
-                answer = mixed[None]
-            answer = augment.resized(answer, (h, w), wrap=wrap)
-            channels = answer[0].permute(1, 2, 0) * self.deviation + self.mean
-            tied = tied_features(guidance, self.axes)
-            features = torch.cat([channels[..., 1:], tied], dim=-1)
-        return channels[..., 0].numpy(), features.numpy(), copied
 
     def carried(
         self,
@@ -211,14 +210,33 @@ class Carrier:
         """
         wrap = header.wrap == "wrap"
         itself = asked.judged and asked.left_out is None and self._is_own(guidance)
-        heights, features, copied = self.textures(
-            guidance, wrap=wrap, averaged=asked.averaged,
-            copier=None if itself else self.copier(material, asked.left_out),
-        )  # fmt: skip
-        if asked.slope is not None:
+        answer, share = self.answer(guidance, wrap=wrap, averaged=asked.averaged), 0.0
+        copier = None if itself else self.copier(material, asked.left_out)
+        if copier is not None and self.mix is not None:
+            found = in_parts(copier, self.scaled(answer), wrap=wrap, reach=REACH)
+            mixed, share = self.mix(answer[0], found[0])
+            answer = mixed[None]
+        return self._made(material, answer, guidance, header, share, asked.slope)
+
+    def _made(
+        self,
+        material: NeuBTF,
+        answer: Tensor,
+        guidance: Tensor,
+        header: Header,
+        copied: float,
+        slope: Array | None = None,
+    ) -> NeuBTF:
+        """The material that an answer (1, 1 + free, ...) to a guidance means."""
+        wrap = header.wrap == "wrap"
+        answer = augment.resized(answer, (guidance.shape[2], guidance.shape[3]), wrap=wrap)
+        channels = answer[0].permute(1, 2, 0) * self.deviation + self.mean
+        tied = tied_features(guidance, self.axes)
+        features = torch.cat([channels[..., 1:], tied], dim=-1).numpy()
+        heights: Array = channels[..., 0].numpy()
+        if slope is not None:
             known = np.full(heights.shape, _BY_ENCODER)
-            found = integrate(asked.slope, wrap=wrap, known=heights, by_known=known)
-            heights = found.height
+            heights = integrate(slope, wrap=wrap, known=heights, by_known=known).height
         size: tuple[int, int] = (heights.shape[0], heights.shape[1])
         spec = replace(material.spec, size=size)
         weights = {n: a for n, a in material.weights.items() if not n.startswith("texture.")}
@@ -285,9 +303,38 @@ CARRIERS: dict[str, type[Carrier] | type[PaperCarrier]] = {
 def inside(window: Window, size: Sequence[int]) -> Tensor:
     """(h, w) whether each texel lies in a window of a grid of that size."""
     found = torch.zeros(size[0], size[1], dtype=torch.bool)
-    rows = slice(window.top, window.top + window.height)
-    found[rows, window.left : window.left + window.width] = True
+    found[window.slices()] = True
     return found
+
+
+def _bounds(among: Tensor) -> tuple[tuple[slice, slice], ...]:
+    """The rows and columns of what is set in (h, w); with REACH around; and those in these."""
+    at, around, within = [], [], []
+    for dim, side in ((1, among.shape[0]), (0, among.shape[1])):
+        found = torch.nonzero(among.any(dim=dim))[:, 0]
+        first, stop = int(found[0]), int(found[-1]) + 1
+        begin = max(first - REACH, 0)
+        at.append(slice(first, stop))
+        around.append(slice(begin, min(stop + REACH, side)))
+        within.append(slice(first - begin, stop - begin))
+    return (at[0], at[1]), (around[0], around[1]), (within[0], within[1])
+
+
+def part_of(material: NeuMIPMaterial, part: Window) -> NeuMIPMaterial:
+    """A part of a material of one level, which ends at its borders if it is not the whole."""
+    h, w = material.spec.size
+    if part == Window(0, 0, h, w):
+        return material
+    weights = {
+        name: array[part.slices()] if name.startswith("texture.") else array
+        for name, array in material.weights.items()
+    }
+    # Heights count in tile widths, and the tile is narrower.
+    heights = weights["texture.heights"].astype(np.float32) * (w / part.width)
+    weights["texture.heights"] = heights.astype(weights["texture.heights"].dtype)
+    size = (part.height, part.width)
+    header = replace(material.header, grid=size, wrap="clamp")
+    return type(material)(replace(material.spec, size=size), weights, header)
 
 
 def of_kind(image: Tensor, averaged: bool) -> Tensor:
@@ -323,11 +370,10 @@ def errors_in(
 ) -> dict[str, float]:
     """Errors by the keys of `ERRORS` over a window of some pairs; empty where none is measured."""
     pooled = metrics.Pooled()
-    rows = slice(window.top, window.top + window.height)
-    cols = slice(window.left, window.left + window.width)
+    at = window.slices()
     for pair in pairs:
-        answer = answer_pair(material, btf, int(pair))
-        pooled.add(answer[rows, cols], btf.texture(int(pair))[rows, cols])
+        answer = answer_pair(material, btf, int(pair), at)
+        pooled.add(answer, btf.texture(int(pair))[at])
     if not pooled.values:
         return {}
     errors = pooled.errors()

@@ -23,8 +23,10 @@ from torch import Tensor
 
 # Sides of the patch that is compared and of the one that votes, and texels between patches.
 SEEN, VOTING, STEP = 5, 8, 4
+# No texel further away than this has a say in a copy; the encoder's stride divides it.
+REACH = 16
 # Components of a patch that are compared; places of the sample at most, and how many vote.
-_COMPONENTS, _MOST_PLACES, _VOTERS = 24, 1 << 16, 16
+_COMPONENTS, _MOST_PLACES, _VOTERS = 24, 1 << 15, 16
 # Texels of a patch that are looked at for its components, and rows compared at once.
 _LOOKED_AT, _ROWS = 1 << 13, 512
 # Pull of the measured mix towards the encoder's answer, texels times variance; quantile of the
@@ -205,8 +207,13 @@ def _components(around: Tensor, rows: Tensor, cols: Tensor) -> Tensor:
 
 
 def _some(count: int, most: int) -> Tensor:
-    """Up to `most` indices below `count`, evenly spread."""
-    return torch.linspace(0, count - 1, min(count, most), dtype=torch.float64).long()
+    """Up to `most` indices below `count`, ascending, drawn at random.
+
+    Evenly spread ones fall on the same few columns of an image.
+    """
+    if count <= most:
+        return torch.arange(count)
+    return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:most].sort()[0]
 
 
 def _around(image: Tensor, reach: int, *, wrap: bool | None, beyond: float = 0.0) -> Tensor:

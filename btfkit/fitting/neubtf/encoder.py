@@ -105,10 +105,13 @@ def encode_in_tiles(encoder: Encoder, guidance: Tensor, *, wrap: bool) -> Tensor
     return in_parts(looked_at, guidance, wrap=wrap)
 
 
-def in_parts(function: Callable[[Tensor], Tensor], image: Tensor, *, wrap: bool) -> Tensor:
-    """(1, outputs, h, w) of a function of images (1, inputs, h, w) that sees no further than REACH.
+def in_parts(
+    function: Callable[[Tensor], Tensor], image: Tensor, *, wrap: bool, reach: int = REACH
+) -> Tensor:
+    """(1, outputs, h, w) of a function of images (1, inputs, h, w) that sees no further than reach.
 
-    It is given parts whose sides the stride divides, with REACH texels and more around them.
+    It is given parts whose sides the stride divides, with `reach` texels and more around them;
+    the stride divides that, too.
     """
     h, w = image.shape[-2:]
     bands = []
@@ -116,17 +119,18 @@ def in_parts(function: Callable[[Tensor], Tensor], image: Tensor, *, wrap: bool)
         parts = []
         for left in range(0, w, _PART):
             high, wide = min(_PART, h - top), min(_PART, w - left)
-            rows, cols = _around(top, high, h, wrap=wrap), _around(left, wide, w, wrap=wrap)
+            rows = _around(top, high, h, reach, wrap=wrap)
+            cols = _around(left, wide, w, reach, wrap=wrap)
             answer = function(image[:, :, rows][:, :, :, cols])
-            parts.append(answer[:, :, REACH : REACH + high, REACH : REACH + wide])
+            parts.append(answer[:, :, reach : reach + high, reach : reach + wide])
         bands.append(torch.cat(parts, dim=3))
     return torch.cat(bands, dim=2)
 
 
-def _around(start: int, count: int, side: int, *, wrap: bool) -> Tensor:
-    """Indices of `count` texels and of REACH and more on both sides of them."""
+def _around(start: int, count: int, side: int, reach: int, *, wrap: bool) -> Tensor:
+    """Indices of `count` texels and of `reach` and more on both sides of them."""
     length = -(-count // STRIDE) * STRIDE
-    at = torch.arange(start - REACH, start + length + REACH)
+    at = torch.arange(start - reach, start + length + reach)
     if wrap:
         return at % side
     at = at % (2 * side)

@@ -26,6 +26,11 @@ class Window(NamedTuple):
     height: int
     width: int
 
+    def slices(self) -> tuple[slice, slice]:
+        """Rows and columns of a window that does not reach around the border."""
+        rows = slice(self.top, self.top + self.height)
+        return rows, slice(self.left, self.left + self.width)
+
 
 @final
 @dataclass(frozen=True)

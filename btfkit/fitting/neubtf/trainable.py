@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, ClassVar, cast, final
 
 import numpy as np
@@ -29,11 +28,11 @@ from btfkit.fitting.neubtf import augment
 from btfkit.fitting.neubtf.carrier import (
     ERRORS,
     INPUTS,
-    Asked,
     Carrier,
     colour_axes,
     errors_in,
     of_kind,
+    part_of,
     tied_features,
 )
 from btfkit.fitting.neubtf.copying import Mix
@@ -47,7 +46,6 @@ from btfkit.fitting.neumip.trainable import NeuMIP
 from btfkit.fitting.optimisers import Adam, Optimiser
 from btfkit.fitting.schedule import pace
 from btfkit.materials.neubtf.material import NeuBTF as Evaluated
-from btfkit.materials.neumip.material import NeuMIPMaterial
 from btfkit.native.neural.layout import Array
 from btfkit.settings import parsed
 
@@ -65,7 +63,7 @@ _LEAST_COSINE = 0.85
 _MARGIN = 8
 # How far heights (texels) and features (deviations) are moved to see what depends on them.
 _HEIGHT_STEP, _FEATURE_STEP, _LOOKED_AT = 0.15, 0.25, 1 << 14
-# Texels a side that tell it.
+# Texels a side that tell it, and how well is carried.
 _MOST_SIDE = 256
 
 
@@ -147,10 +145,7 @@ class NeuBTF(Trainable):
             self._wanted = self._aim()
         done = (progress - share) / (1 - share)
         if self._kept and done >= _GIVEN_BACK and not self._carried:
-            if self.settings.copied:
-                scale = (self._weight * len(self._weight)).sqrt()
-                self._mix = self.carrier().mix_of(self.material(), self._kept, scale)
-            self._carried = self._measured(self._kept)
+            self._carried = self._measured(*self._judged(self._kept))
         return self._teach(done, self._wanted)
 
     def settled(self, progress: float) -> bool:
@@ -168,7 +163,7 @@ class NeuBTF(Trainable):
     def stated(self) -> dict[str, Any]:
         if not self._kept or not self._carried:
             return {}
-        found = {**self._carried, "carried_window": list(self._kept)}
+        found = {**self._carried, "carried_window": list(self._judged(self._kept)[1])}
         return found | ({"copied": self._copied} if self._mix is not None else {})
 
     def score(self) -> float:
@@ -265,9 +260,11 @@ class NeuBTF(Trainable):
     def _felt(self) -> list[float]:
         """Mean squared change of log(1 + rgb) a unit (texel, or 1) of every channel's square."""
         batch = self.free.source.batch(self._steps, _LOOKED_AT)
-        material = _part_of(self.free.material())
+        material = self.free.material()
+        h, w = material.spec.size
+        # Which texels of it answer does not matter.
+        material = part_of(material, Window(0, 0, min(h, _MOST_SIDE), min(w, _MOST_SIDE)))
         weights = dict(material.weights)
-        # A part's own uv: which texel of it answers does not matter.
         asked = (batch.uv.copy(), batch.light.copy(), batch.view.copy())
 
         def logs(name: str, channel: int, step: float) -> NDArray[np.float32]:
@@ -355,34 +352,37 @@ class NeuBTF(Trainable):
             return None
         return Window(h // 4, w // 4, h // 2, w // 2)
 
-    def _measured(self, window: Window) -> dict[str, float]:
-        """Errors of the encoder's answer alone over a window, on held-out pairs."""
-        material = self.material()
-        carried = self.carrier().carried(
-            material, self._guidance, material.header, Asked(left_out=window)
-        )
+    def _judged(self, kept: Window) -> tuple[Window, Window]:
+        """A part of the sample, all of a small one, and what of the kept quarter lies in it.
+
+        So much tells how well is carried; to look for patches in all of a large sample takes
+        minutes.
+        """
+        sides = []
+        for first, long, side in zip(kept[:2], kept[2:], self._btf.shape[1:3], strict=True):
+            start = max(first - _MOST_SIDE // 2, 0) if side > _MOST_SIDE else 0
+            stop = min(start + _MOST_SIDE, side)
+            sides.append((start, stop - start, first, min(first + long, stop) - first))
+        (top, high, row, rows), (left, wide, col, cols) = sides
+        return Window(top, left, high, wide), Window(row, col, rows, cols)
+
+    def _measured(self, part: Window, window: Window) -> dict[str, float]:
+        """Errors of what is carried onto a window, on held-out pairs; finds how much to copy.
+
+        Args:
+            part: of the sample, which is all that is looked at. window: in it, of the sample.
+        """
+        found = part_of(self.free.material(), part)
+        material = Evaluated.of_finest(found.spec, found.weights, found.header)
+        left_out = Window(window.top - part.top, window.left - part.left, *window[2:])
+        scale = (self._weight * len(self._weight)).sqrt() if self.settings.copied else None
+        carried, self._mix = self.carrier().of_part(part).judged(material, left_out, scale)
         self._copied = float(carried.header.provenance.get("copied", 0.0))
         order = np.random.default_rng([self._generators.seed, 0xCA2]).permutation(self._test)
-        return errors_in(carried, self._btf, order[:_CARRIED_PAIRS], window)
+        seen = self._btf.subset(order[:_CARRIED_PAIRS]).crop(*part.slices())
+        return errors_in(carried, seen, np.arange(len(seen)), left_out)
 
 
 def turned(image: Tensor, turn: int) -> Tensor:
     """(b, c, h, w) turned by `turn` mod 4 quarters, mirrored first from 4 on."""
     return torch.rot90(image.flip(3) if turn >= 4 else image, turn % 4, (2, 3))
-
-
-def _part_of(material: NeuMIPMaterial) -> NeuMIPMaterial:
-    """At most `_MOST_SIDE` texels a side of a material of one level: its corner, as it answers."""
-    h, w = material.spec.size
-    part = min(h, _MOST_SIDE), min(w, _MOST_SIDE)
-    if part == (h, w):
-        return material
-    weights = {
-        name: array[: part[0], : part[1]] if name.startswith("texture.") else array
-        for name, array in material.weights.items()
-    }
-    # Heights count in tile widths, and the tile is narrower.
-    heights = weights["texture.heights"].astype(np.float32) * (w / part[1])
-    weights["texture.heights"] = heights.astype(weights["texture.heights"].dtype)
-    header = replace(material.header, grid=part, wrap="clamp")
-    return type(material)(replace(material.spec, size=part), weights, header)

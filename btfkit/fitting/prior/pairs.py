@@ -25,6 +25,8 @@ _PAIRS, _MOST_TEXELS = 1536, 1 << 20
 # Of a coarser level a quarter of the pairs is enough.
 _COARSE_PAIRS, _MOST_COARSE = 128, 1 << 17
 _LOWEST_Z = 0.02
+# Texels of guesses that are asked together.
+_AT_A_TIME = 1 << 14
 # Guessed lamps stand so many sample widths away where the measured ones are near.
 _FAR = 1e4
 
@@ -125,15 +127,20 @@ def _images(
          for side, k in zip((h, w), kept, strict=True)], axis=1,
     ).astype(np.int32)  # fmt: skip
     values = np.empty((count, *kept, c), np.float16)
-    for k, (light, view) in enumerate(zip(*some, strict=True)):
-        rows, cols = (
-            phase[k, axis] + stride * np.arange(size) + 0.5 for axis, size in enumerate(kept)
-        )
-        v, u = np.meshgrid(rows / h, cols / w, indexing="ij")
-        uv = np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float32)
-        wide = 0.5 if blur is None else float(blur[k])
-        answer = guess.answers(uv, light[None], view[None], blur=wide, seed=k)
-        values[k] = np.minimum(answer, np.finfo(np.float16).max).reshape(*kept, c)
+    row, col = (stride * np.arange(size) + 0.5 for size in kept)
+    texels = kept[0] * kept[1]
+    # Every blur has samples of its own; what is sharp is asked together.
+    step = max(_AT_A_TIME // texels, 1) if blur is None else 1
+    for first in range(0, count, step):
+        part = slice(first, min(first + step, count))
+        each = part.stop - first
+        uv = np.empty((each, *kept, 2), np.float32)
+        uv[..., 0] = ((phase[part, 1, None] + col) / w)[:, None]
+        uv[..., 1] = ((phase[part, 0, None] + row) / h)[..., None]
+        light, view = (np.repeat(d[part], texels, axis=0) for d in some)
+        wide = 0.5 if blur is None else float(blur[first])
+        answer = guess.answers(uv.reshape(-1, 2), light, view, blur=wide, seed=first)
+        values[part] = np.minimum(answer, np.finfo(np.float16).max).reshape(each, *kept, c)
     # Images of one table are all near or all far: far lamps of near data stand far away.
     edges = [0.0 if p is None else btf.texel_mm or 0.0
              for p in (btf.light_position, btf.view_position)]  # fmt: skip
