@@ -13,6 +13,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.calibration.kinematics import check_rotation
 from btfkit.errors import CalibrationError
 from btfkit.sequence import Frame
 
@@ -97,6 +98,7 @@ def nominal(rig: Mapping[str, Any]) -> Placement:
         focal, centre = (np.asarray(camera[key], float) for key in ("focal_px", "centre_px"))
         if eye.shape != (3,) or turn.shape != (3, 3) or lamp.shape != (3,) or focal.shape != (2,):
             raise ValueError(f"shapes {eye.shape}, {turn.shape}, {lamp.shape}, {focal.shape}")
+        check_rotation(turn)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CalibrationError(
             f"rig of {_DOCUMENT} does not tell where camera and light are ({error!r})",
