@@ -42,5 +42,5 @@ CAMPAIGNS = {
     "malice": Campaign("campaigns.malice:malice", share=2, limit_s=20),
     "queries": Campaign("campaigns.queries:queries", share=4, limit_s=30, limit_bytes=None),
     "kills": Campaign("campaigns.kills:kills", share=4, limit_s=300, limit_bytes=None),
-    "disks": Campaign("campaigns.kills:disks", share=2, limit_s=300, limit_bytes=None, root=True),
+    "disks": Campaign("campaigns.disks:disks", share=2, limit_s=300, limit_bytes=None, root=True),
 }

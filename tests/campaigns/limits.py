@@ -24,8 +24,10 @@ LIMIT_S = 5.0
 LIMIT_BYTES = 1 << 30
 # A worker flushes its counts this often; what a crash takes with it is not counted.
 _FLUSH_S = 1.0
-# Looked at by wall clock only after the processor's: machines are shared.
-_WALL_FACTOR = 60
+# A worker that waits for nothing that comes uses no processor: asleep so many times the limit, it
+# hangs. One that waits for the processor itself is not asleep: machines are shared.
+_ASLEEP_FACTOR = 60
+_LOOK_S = 0.02
 
 
 class Find(AssertionError):  # noqa: N818
@@ -81,7 +83,7 @@ def _one_worker(
     os.close(to_parent)
     os.set_blocking(from_child, False)
     buffer = b""
-    hung = None
+    hung, asleep = None, (0, 0.0)
     while True:
         with contextlib.suppress(BlockingIOError):
             while block := os.read(from_child, 1 << 16):
@@ -93,12 +95,11 @@ def _one_worker(
         if ended:
             break
         seed, since, cpu = struct.unpack("<qdd", shared[:24])
-        if since and (
-            _cpu_s(child) - cpu > limit_s or time.monotonic() - since > _WALL_FACTOR * limit_s
-        ):
+        asleep = seed, (asleep[1] if asleep[0] == seed else 0.0) + _LOOK_S * _sleeps(child)
+        if since and (_cpu_s(child) - cpu > limit_s or asleep[1] > _ASLEEP_FACTOR * limit_s):
             hung = seed
             os.kill(child, signal.SIGKILL)
-        time.sleep(0.02)
+        time.sleep(_LOOK_S)
     with contextlib.suppress(BlockingIOError):
         while block := os.read(from_child, 1 << 16):
             buffer += block
@@ -123,11 +124,21 @@ def _note(result: Result, line: dict[str, Any]) -> None:
     result.next_seed = line["next"]
 
 
+def _stat(process: int) -> list[str]:
+    """Of /proc: the state, and the fields behind it; none where there is no such process."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
+    return []
+
+
 def _cpu_s(process: int) -> float:
-    with contextlib.suppress(OSError, ValueError):
-        fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    return 0.0
+    fields = _stat(process)
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else 0.0
+
+
+def _sleeps(process: int) -> bool:
+    """Whether it waits for something else than the processor or a disk."""
+    return _stat(process)[:1] == ["S"]
 
 
 def _worker(

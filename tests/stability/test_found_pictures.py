@@ -77,3 +77,13 @@ def test_a_bmp_whose_pixels_name_no_colour_of_its_palette_is_refused(bits: int, 
             images.read(
                 "a.bmp", _bitmap(codes * 0, bits, used, {8: 1, 4: 2}[bits]), transfer="linear"
             )
+
+
+def test_a_jpeg_of_more_blocks_than_bits_is_cut_short() -> None:
+    flat = np.full((1000, 1000, 3), 90, np.uint8)
+    data = bytearray(cv2.imencode(".jpg", flat)[1].tobytes())
+    assert images.read("a.jpg", bytes(data), transfer="linear").shape == flat.shape
+    at = data.index(b"\xff\xc0") + 5
+    data[at : at + 4] = struct.pack(">HH", 9000, 9000)
+    with pytest.raises(FormatError, match="cut short"):
+        images.read("a.jpg", bytes(data), transfer="linear")
