@@ -37,49 +37,58 @@ def disks(folder: Path) -> Attempt:
             each.clean()
 
     def attempt(seed: int) -> Counter[str]:
-        number, (kind, which) = seed // 6, divmod(seed % 6, 3)
-        name = list(made)[which]
+        name = list(made)[seed % 3]
         each = made[name]
         with _mounted(disk):
-            if kind:
-                # The folder itself is one; one is left at the least.
-                _mount(disk, f"remount,nr_inodes={2 + number % _FILES[name]}")
-            else:
-                step, most = _STEPS[name]
-                pages = 1 + step * number % most
-                if isinstance(each, jobs.Capture):
-                    # It asks for room before it begins.
-                    each.begun = lambda: _fill(disk, pages)
-                else:
-                    _mount(disk, f"remount,size={_PAGE * pages}")
+            _shrink(disk, each, name, seed)
             code, _spent = jobs.in_child(each.job, None, log)
-            text = log.read_text()
-            if code not in (0, 1):
-                raise Find(f"{name} ends with {code}: {text[-400:]}")
-            if not code:
-                if each.held() != wanted[name]:
-                    raise Find(f"{name}: something else lies under the final name")
-                return Counter({f"{name} had room": 1})
-            said = [line for line in text.splitlines() if line.startswith("btfkit: error")]
-            if len(said) != 1 or "space" not in said[0]:
-                raise Find(f"{name} says {said or text[-300:]!r}")
-            if each.out.exists() and name == "ingest":
-                raise Find("something lies under the final name")
-            if each.out.exists() and name == "fit":
-                # A model is safe before its report is written, and whole.
-                each.held()
-            (disk / "ballast").unlink(missing_ok=True)
-            if isinstance(each, jobs.Capture):
-                each.begun = lambda: None
-            _mount(disk, f"remount,{_ROOM}")
-            code, _spent = jobs.in_child(each.job, None, log)
+            there = each.held() if each.out.exists() and name != "capture" else wanted[name]
+            if there != wanted[name]:
+                # A model is safe before its report is written; then it is whole.
+                raise Find(f"{name}: something else lies under the final name")
             if code:
-                raise Find(f"{name} does not go on ({code}): {log.read_text()[-400:]}")
+                _check_said(name, code, log.read_text())
+                if name == "ingest" and each.out.exists():
+                    raise Find("something lies under the final name")
+                _widen(disk, each)
+                if jobs.in_child(each.job, None, log)[0]:
+                    raise Find(f"{name} does not go on: {log.read_text()[-400:]}")
             if each.held() != wanted[name]:
                 raise Find(f"{name}: what went on differs from what ran through")
-        return Counter({f"full disks of {name}": 1})
+        return Counter({f"full disks of {name}" if code else f"{name} had room": 1})
 
     return attempt
+
+
+def _check_said(name: str, code: int, text: str) -> None:
+    said = [line for line in text.splitlines() if line.startswith("btfkit: error")]
+    if code != 1:
+        raise Find(f"{name} ends with {code}: {text[-400:]}")
+    if len(said) != 1 or "space" not in said[0]:
+        raise Find(f"{name} says {said or text[-300:]!r}")
+
+
+def _shrink(disk: Path, each: jobs.Job, name: str, seed: int) -> None:
+    """Leave so many files, or pages, that each seed's disk is full a write later."""
+    number, kind = seed // 6, seed // 3 % 2
+    if kind:
+        # The folder itself is one.
+        _mount(disk, f"remount,nr_inodes={2 + number % _FILES[name]}")
+        return
+    step, most = _STEPS[name]
+    pages = 1 + step * number % most
+    if isinstance(each, jobs.Capture):
+        # It asks for room before it begins.
+        each.begun = lambda: _fill(disk, pages)
+    else:
+        _mount(disk, f"remount,size={_PAGE * pages}")
+
+
+def _widen(disk: Path, each: jobs.Job) -> None:
+    (disk / "ballast").unlink(missing_ok=True)
+    if isinstance(each, jobs.Capture):
+        each.begun = lambda: None
+    _mount(disk, f"remount,{_ROOM}")
 
 
 def _fill(disk: Path, pages: int) -> None:

@@ -53,6 +53,12 @@ def _npy(header: str, body: bytes = b"") -> bytes:
             _npy("{'descr': '|O', 'fortran_order': False, 'shape': (1, 2)}"),
             "holds less|not a readable",
         ),
+        # No values, in rows that take a minute to go through.
+        (
+            "channels.npy",
+            _npy("{'descr': '<U1', 'fortran_order': False, 'shape': (2000000000, 0, 3)}"),
+            "holds less",
+        ),
         # What is no array comes back from numpy as bytes.
         ("uv.npy", b"no array at all", "not a readable query file"),
     ],
@@ -280,4 +286,12 @@ def test_text_of_a_query_file_that_is_no_unicode_is_refused(tmp_path: Path) -> N
     text = np.frombuffer(b"\xff\xff\xff\x7f", "<U1").reshape(())
     np.savez(path, uv=up[:, :2], light=up, view=up, provenance=text)
     with pytest.raises(FormatError, match="holds text that cannot be read"):
+        queryfile.read(path)
+
+
+def test_channels_are_as_many_names_as_there_are_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "q.npz"
+    up = np.tile(np.float32([0, 0, 1]), (2, 1))
+    np.savez(path, uv=up[:, :2], light=up, view=up, rgb=up, channels=[["R", "G", "B"]])
+    with pytest.raises(FormatError, match=r"channels of shape \(1, 3\) for rgb of 3"):
         queryfile.read(path)
