@@ -28,7 +28,7 @@ def disks(folder: Path) -> Attempt:
     disk.mkdir()
     made = {name: kind(folder, disk) for name, kind in jobs.JOBS.items()}
     wanted: dict[str, bytes] = {}
-    with _mounted(disk):
+    with mounted(disk):
         for name, each in made.items():
             code, _spent = jobs.in_child(each.job, None, log)
             if code:
@@ -39,7 +39,7 @@ def disks(folder: Path) -> Attempt:
     def attempt(seed: int) -> Counter[str]:
         name = list(made)[seed % 3]
         each = made[name]
-        with _mounted(disk):
+        with mounted(disk):
             _shrink(disk, each, name, seed)
             code, _spent = jobs.in_child(each.job, None, log)
             there = each.held() if each.out.exists() and name != "capture" else wanted[name]
@@ -106,7 +106,7 @@ def _mount(where: Path, options: str) -> None:
 
 
 @contextlib.contextmanager
-def _mounted(where: Path) -> Iterator[None]:
+def mounted(where: Path) -> Iterator[None]:
     """A disk in memory where one may mount it; elsewhere there is no such campaign."""
     _mount(where, _ROOM)
     try:

@@ -145,6 +145,10 @@ def _worker(
     prepare: Callable[[Path], Attempt], first: int, last: int | None, end: float,
     limit_bytes: int | None, shared: mmap.mmap, to_parent: int,
 ) -> None:  # fmt: skip
+    # What decoders say of each damaged picture would be a file of gigabytes.
+    sys.stderr = os.fdopen(os.dup(2), "w", buffering=1)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
     with _folder() as folder:
         attempt = prepare(folder)
         if limit_bytes:
