@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from btfkit.conventions import MOST_LOG
-from btfkit.export.package import export
+from btfkit.export import npz
 from btfkit.fitting.neumip import forward
 from btfkit.materials.base import Material
 from btfkit.materials.explained import program_of
@@ -145,7 +145,8 @@ def _compare(material: Material, what: str, ours: np.ndarray, theirs: np.ndarray
 def _exported(material: Material, given: dict[str, np.ndarray], folder: Path) -> np.ndarray:
     out = folder / "export"
     shutil.rmtree(out, ignore_errors=True)
-    export(material, "npz", out)
+    out.mkdir()
+    npz.write(material, material.program(), out)
     np.savez(folder / "q.npz", **given)
     before = sys.argv
     sys.argv = ["evaluate.py", str(folder / "q.npz"), str(folder / "a.npz")]
