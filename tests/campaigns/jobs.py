@@ -57,6 +57,7 @@ def in_child(job: Callable[[], int], after_s: float | None, log: Path) -> tuple[
             with log.open("w") as file:
                 os.dup2(file.fileno(), 1)
                 os.dup2(file.fileno(), 2)
+                sys.stderr = os.fdopen(2, "w", buffering=1, closefd=False)
                 code = job()
                 sys.stdout.flush()
                 sys.stderr.flush()
