@@ -68,6 +68,14 @@ def _one_worker(
     prepare: Callable[[Path], Attempt], result: Result, last: int | None, end: float,
     limit_s: float, limit_bytes: int | None,
 ) -> None:  # fmt: skip
+    with _folder() as folder:
+        _in_folder(folder, prepare, result, last, end, limit_s, limit_bytes)
+
+
+def _in_folder(
+    folder: Path, prepare: Callable[[Path], Attempt], result: Result, last: int | None, end: float,
+    limit_s: float, limit_bytes: int | None,
+) -> None:  # fmt: skip
     shared = mmap.mmap(-1, 24)
     from_child, to_parent = os.pipe()
     sys.stdout.flush()
@@ -75,7 +83,7 @@ def _one_worker(
     if not child:
         os.close(from_child)
         try:
-            _worker(prepare, result.next_seed, last, end, limit_bytes, shared, to_parent)
+            _worker(folder, prepare, result.next_seed, last, end, limit_bytes, shared, to_parent)
         except BaseException:
             traceback.print_exc()
             os._exit(70)
@@ -142,42 +150,41 @@ def _sleeps(process: int) -> bool:
 
 
 def _worker(
-    prepare: Callable[[Path], Attempt], first: int, last: int | None, end: float,
+    folder: Path, prepare: Callable[[Path], Attempt], first: int, last: int | None, end: float,
     limit_bytes: int | None, shared: mmap.mmap, to_parent: int,
 ) -> None:  # fmt: skip
     # What decoders say of each damaged picture would be a file of gigabytes.
     sys.stderr = os.fdopen(os.dup(2), "w", buffering=1)
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 2)
-    with _folder() as folder:
-        attempt = prepare(folder)
-        if limit_bytes:
-            held = int(Path("/proc/self/statm").read_text().split()[0]) * mmap.PAGESIZE
-            resource.setrlimit(resource.RLIMIT_AS, (held + limit_bytes, resource.RLIM_INFINITY))
-        counts: Counter[str] = Counter()
-        finds: list[dict[str, Any]] = []
-        flushed = time.monotonic()
-        seed = first
-        while time.monotonic() < end and (last is None or seed < last):
-            cpu = _cpu_s(os.getpid())
-            shared[:24] = struct.pack("<qdd", seed, time.monotonic(), cpu)
-            try:
-                counts.update(attempt(seed))
-            except Find as find:
-                finds.append({"seed": seed, "what": " ".join(str(find).split())[:600]})
-            except MemoryError:
-                finds.append({"seed": seed, "what": f"more than {limit_bytes} bytes"})
-            except Exception as error:
-                where = traceback.extract_tb(error.__traceback__)[-1]
-                what = f"{type(error).__name__}: {error} at {where.filename}:{where.lineno}"
-                finds.append({"seed": seed, "what": " ".join(what.split())[:600]})
-            counts["tried"] += 1
-            seed += 1
-            if finds or time.monotonic() - flushed > _FLUSH_S:
-                _send(to_parent, counts, finds, seed)
-                counts, finds, flushed = Counter(), [], time.monotonic()
-        shared[:24] = struct.pack("<qdd", seed, 0.0, 0.0)
-        _send(to_parent, counts, finds, seed)
+    attempt = prepare(folder)
+    if limit_bytes:
+        held = int(Path("/proc/self/statm").read_text().split()[0]) * mmap.PAGESIZE
+        resource.setrlimit(resource.RLIMIT_AS, (held + limit_bytes, resource.RLIM_INFINITY))
+    counts: Counter[str] = Counter()
+    finds: list[dict[str, Any]] = []
+    flushed = time.monotonic()
+    seed = first
+    while time.monotonic() < end and (last is None or seed < last):
+        cpu = _cpu_s(os.getpid())
+        shared[:24] = struct.pack("<qdd", seed, time.monotonic(), cpu)
+        try:
+            counts.update(attempt(seed))
+        except Find as find:
+            finds.append({"seed": seed, "what": " ".join(str(find).split())[:600]})
+        except MemoryError:
+            finds.append({"seed": seed, "what": f"more than {limit_bytes} bytes"})
+        except Exception as error:
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            what = f"{type(error).__name__}: {error} at {where.filename}:{where.lineno}"
+            finds.append({"seed": seed, "what": " ".join(what.split())[:600]})
+        counts["tried"] += 1
+        seed += 1
+        if finds or time.monotonic() - flushed > _FLUSH_S:
+            _send(to_parent, counts, finds, seed)
+            counts, finds, flushed = Counter(), [], time.monotonic()
+    shared[:24] = struct.pack("<qdd", seed, 0.0, 0.0)
+    _send(to_parent, counts, finds, seed)
 
 
 def _send(to: int, counts: Counter[str], finds: list[dict[str, Any]], seed: int) -> None:

@@ -227,6 +227,13 @@ def _no_run(folder: Path) -> None:
     path.write_text(json.dumps(told))
 
 
+def _far(folder: Path) -> None:
+    path = folder / "sequence.json"
+    told = json.loads(path.read_text())
+    told["rig"]["axes"][0]["point_mm"] = [1e308, 0, 0]
+    path.write_text(json.dumps(told))
+
+
 def _shard(folder: Path) -> None:
     path = folder / "texture" / "zarr.json"
     told = json.loads(path.read_text())
@@ -250,6 +257,7 @@ def _frame(folder: Path) -> None:
         ("sequence", _frame, "cut short"),
         ("sequence", _rotation, "expected three perpendicular unit vectors"),
         ("sequence", _no_rotation, "expected three perpendicular unit vectors"),
+        ("sequence", _far, r"the camera of pair 0 lies at \[.*e\+308"),
         ("sequence", _away, "no frame's camera sees the middle of the sample"),
         ("sequence", _name, r"first: frames/003\.\\x00g\)"),
         ("diligent", _intensity, "holds one that is not 1e-15 to"),
