@@ -257,7 +257,7 @@ def _frame(folder: Path) -> None:
         ("sequence", _frame, "cut short"),
         ("sequence", _rotation, "expected three perpendicular unit vectors"),
         ("sequence", _no_rotation, "expected three perpendicular unit vectors"),
-        ("sequence", _far, r"the camera of pair 0 lies at \[.*e\+308"),
+        ("sequence", _far, r"the camera of pair . lies at \[.*e\+30"),
         ("sequence", _away, "no frame's camera sees the middle of the sample"),
         ("sequence", _name, r"first: frames/003\.\\x00g\)"),
         ("diligent", _intensity, "holds one that is not 1e-15 to"),
