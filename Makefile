@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 KERNELS := $(wildcard btfkit/native/*.hpp btfkit/native/*/*.cpp btfkit/native/*/*.hpp)
 
-.PHONY: demo test test-quick check bench campaign wheel docs clean
+.PHONY: demo test test-quick check bench campaign sample wheel docs clean
 
 demo: $(STAMP)
 	$(BIN)/python examples/demo.py
@@ -28,13 +28,19 @@ campaign: $(STAMP)
 	PYTHONPATH=tests:tests/devices:tests/export OMP_NUM_THREADS=1 BTFKIT_THREADS=1 \
 	  $(BIN)/python -W ignore -m campaigns $(NAMES) --minutes $(or $(MINUTES),60)
 
+# Five minutes of all campaigns together, the same seeds every time; a find is an error.
+sample: $(STAMP)
+	PYTHONPATH=tests:tests/devices:tests/export OMP_NUM_THREADS=1 BTFKIT_THREADS=1 \
+	  $(BIN)/python -W ignore -m campaigns --sample --minutes $(or $(MINUTES),15)
+
 # Wheels for glibc 2.28 and later, and an sdist, checked: make wheel PYTHONS="python3.11 python3.12"
 wheel:
 	$(PYTHON) packaging/wheel.py $(PYTHONS)
 
 # The documentation as a site, in build/site; a warning is an error.
 docs: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[docs]"
+	$(BIN)/python packaging/extra.py docs | xargs -d '\n' \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check --retries 3 --timeout 60
 	$(BIN)/python -m mkdocs build
 
 bench: $(STAMP)

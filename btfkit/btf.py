@@ -188,7 +188,8 @@ class BTF:
         """The pairs whose light and view are in a slice of the distinct directions.
 
         Args:
-            lights, views: over the distinct directions in the order of first appearance.
+            lights: over the distinct directions in the order of first appearance.
+            views: as `lights`.
         """
         keep = np.ones(len(self), bool)
         for direction, chosen in ((self.light, lights), (self.view, views)):
@@ -204,7 +205,8 @@ class BTF:
         """The BTF of a window; a true window clamps at its borders.
 
         Args:
-            rows, cols: texel ranges, half open, as in numpy but without step.
+            rows: texel range, half open, as in numpy but without step.
+            cols: as `rows`.
         """
         _, h, w, _ = self.shape
         r, c = (slice(*s.indices(size)[:2]) for s, size in ((rows, h), (cols, w)))

@@ -25,7 +25,7 @@ class BtfkitError(Exception):
     """
 
     def __init__(self, message: str, *, remedy: str | None = None) -> None:
-        super().__init__(f"{message}; {remedy}" if remedy else message)
+        super().__init__(printable(f"{message}; {remedy}" if remedy else message))
         self.message = message
         self.remedy = remedy
 

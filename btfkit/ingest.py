@@ -89,7 +89,10 @@ def ingest(
         format: a name of `io.FORMATS`; None detects it.
         options: what the format leaves open, as its reader names it; None values are left out.
         part: which part is read.
-        dtype, jobs, force, progress: as in `io.store.writer.write`.
+        dtype: as in `io.store.writer.write`, as are the next three.
+        jobs: threads.
+        force: whether an existing store is replaced.
+        progress: called with the textures written and all.
         phase: called with the name of each part as it begins: opening, hashing, reading and
             writing (each texture is decoded once and written at once).
 

@@ -29,6 +29,8 @@ Array = NDArray[np.float32]
 _WORTHWHILE, _REGISTERED = 0.02, 256
 # Views are the same whose directions differ by less.
 _SAME_VIEW = 2e-3
+# No rig is larger than a thousand kilometres.
+_FARTHEST_MM = 1e9
 
 
 def detect(path: Path) -> bool:
@@ -83,8 +85,8 @@ def read(
     groups = list(sequence.groups("sample").values())
     grid = grid_of(sequence, rig, groups, texel_mm)
     poses = [sequence.frames[group[0]].axes for group in groups]
-    light = np.array([rig.geometry.light_position(LAMP, at) for at in poses], np.float32)
-    view = np.array([rig.geometry.view_position(at) for at in poses], np.float32)
+    light = _positions("light", [rig.geometry.light_position(LAMP, at) for at in poses])
+    view = _positions("camera", [rig.geometry.view_position(at) for at in poses])
     heights = None if relief is None else _heights(relief, grid)
     there = [tuple(i for i in group if sequence.frames[i].file not in lacks.files)
              for group in groups]  # fmt: skip
@@ -158,6 +160,18 @@ def _registered(
         middle.brightness, list(views.values()), directions.normalize(light), toward,
         error=None if error is None else error / grid.texel_mm,
     )  # fmt: skip
+
+
+def _positions(what: str, found: list[NDArray[np.float64]]) -> Array:
+    """(n, 3) float32 mm. CalibrationError where one is farther away than anything is."""
+    positions = np.array(found)
+    off = np.flatnonzero(~(np.abs(positions) < _FARTHEST_MM).all(axis=1))
+    if len(off):
+        raise CalibrationError(
+            f"the {what} of pair {off[0]} lies at {positions[off[0]].tolist()} mm",
+            remedy="correct rig.axes, camera and light of sequence.json",
+        )
+    return positions.astype(np.float32)
 
 
 def _heights(path: Path, grid: Grid) -> NDArray[np.float64]:

@@ -20,6 +20,16 @@ Body = Literal["sample", "camera", "light"]
 BODIES: tuple[Body, ...] = ("sample", "camera", "light")
 
 
+def check_rotation(turn: Floats) -> None:
+    """Raise a ValueError where (3, 3) `turn` is no rotation, to the three digits people write."""
+    # Numbers whose squares have no room are none either.
+    plain = np.isfinite(turn).all() and np.abs(turn).max() < 2
+    if not plain or not np.allclose(turn @ turn.T, np.eye(3), atol=4e-3) or np.linalg.det(turn) < 0:
+        raise ValueError(
+            f"rotation {turn.tolist()}; expected three perpendicular unit vectors, right-handed"
+        )
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Rigid:

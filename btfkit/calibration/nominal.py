@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from btfkit.calibration.board import Board
 from btfkit.calibration.camera_model import Camera
 from btfkit.calibration.geometry import Geometry
-from btfkit.calibration.kinematics import Axis, Kinematics, Rigid
+from btfkit.calibration.kinematics import Axis, Kinematics, Rigid, check_rotation
 from btfkit.errors import CalibrationError
 from btfkit.sequence import Sequence
 
@@ -102,6 +102,7 @@ def _camera(entry: Mapping[str, Any], size: tuple[int, int]) -> tuple[Camera, Ri
     lens = np.concatenate([focal, centre, np.zeros(5)])
     if turn.shape != (3, 3) or lens.shape != (9,):
         raise ValueError(f"camera of shapes {turn.shape} and {focal.shape}")
+    check_rotation(turn)
     camera = Camera(size[1], size[0], lens)
     return camera, Rigid(turn, -turn @ eye)
 

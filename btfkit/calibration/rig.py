@@ -112,7 +112,8 @@ class CalibratedRig:
         """Of the camera in the middle of the sample, by area; 0 where it does not see it."""
         pose = self.geometry.sample_to_camera(readings)
         _, slope, _ = self.geometry.camera.project_with_derivatives(pose(np.zeros(3)))
-        area = abs(float(np.linalg.det(slope @ pose.rotation[:, :2])))
+        with np.errstate(invalid="ignore"):
+            area = abs(float(np.linalg.det(slope @ pose.rotation[:, :2])))
         return float(np.sqrt(area)) if np.isfinite(area) else 0.0
 
 
@@ -130,6 +131,11 @@ def grid_of(
         )
     if texel_mm is None:
         pixels = max(rig.pixels_a_mm(sequence.frames[group[0]].axes) for group in groups)
+        if not pixels:
+            raise CalibrationError(
+                "no frame's camera sees the middle of the sample",
+                remedy="correct rig.camera and rig.axes of sequence.json, or give --texel-mm",
+            )
         wanted = _PIXELS_A_TEXEL[rig.mosaic] / pixels
         texel_mm = float(size[0]) / max(round(size[0] / wanted), 1)
     rows, columns = (max(round(float(side) / texel_mm), 1) for side in (size[1], size[0]))

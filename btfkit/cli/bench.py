@@ -10,7 +10,14 @@ import click
 
 from btfkit.cli.bar import Bar
 from btfkit.cli.many import cluster_option, over, several
-from btfkit.cli.options import DurationType, SettingType, out_option, seed_option
+from btfkit.cli.options import (
+    DurationType,
+    SettingType,
+    completed,
+    fitted_models,
+    out_option,
+    seed_option,
+)
 from btfkit.cli.outcome import FAILED, Outcome, verb
 
 if TYPE_CHECKING:
@@ -25,7 +32,10 @@ btfkit bench wool.btf.zarr --questions && btfkit bench wool.btf.zarr --answers o
 )
 @click.argument("names", nargs=-1)
 @out_option("Folder of results, resumed where it exists; by default bench")
-@click.option("--model", "models", multiple=True, help="Only these models; repeatable.")
+@click.option(
+    "--model", "models", multiple=True, help="Only these models; repeatable.",
+    shell_complete=completed(fitted_models),
+)  # fmt: skip
 @click.option(
     "--budget", "budgets", type=DurationType(), multiple=True,
     help="CPU time of training, over all threads; repeatable.",

@@ -16,6 +16,8 @@ from btfkit.cli.options import (
     DurationType,
     LocationType,
     SettingType,
+    completed,
+    fitted_models,
     force_option,
     out_option,
     seed_option,
@@ -48,7 +50,10 @@ btfkit fit *.btf.zarr --model neumip --cluster tcp://host:8786 -o models""",
     more=_models,
 )
 @click.argument("sources", metavar="[SOURCE]", nargs=-1, type=LocationType())
-@click.option("--model", default="auto", show_default=True, help="Name of a model, or auto.")
+@click.option(
+    "--model", default="auto", show_default=True, help="Name of a model, or auto.",
+    shell_complete=completed(lambda: ["auto", *fitted_models()]),
+)  # fmt: skip
 @click.option(
     "--from", "teacher", type=click.Path(path_type=Path),
     help="A fitted model that teaches --model student; SOURCE may be left out then.",

@@ -16,9 +16,11 @@ from btfkit.cli.options import (
     LocationType,
     SliceType,
     WindowType,
+    completed,
     force_option,
     location_option,
     seed_option,
+    source_formats,
 )
 from btfkit.cli.outcome import Outcome, verb
 from btfkit.cli.preview import of_btf, preview_option
@@ -35,7 +37,10 @@ btfkit ingest wool/ felt.zip cord.btf --cluster local:2 -o stores""",
 )
 @click.argument("sources", metavar="SOURCE", nargs=-1, required=True, type=LocationType())
 @location_option("The store to write; by default SOURCE.btf.zarr here; of several, their folder")
-@click.option("--format", "format_name", help="Read as this format instead of detecting it.")
+@click.option(
+    "--format", "format_name", help="Read as this format instead of detecting it.",
+    shell_complete=completed(source_formats),
+)  # fmt: skip
 @click.option("--roi", type=WindowType(), help="Read only this window of rows and columns.")
 @click.option("--views", type=SliceType(), help="Read only these of the distinct views.")
 @click.option("--lights", type=SliceType(), help="Read only these of the distinct lights.")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, final
 
 import click
+from click.shell_completion import CompletionItem
 
 from btfkit import settings
 from btfkit.errors import BtfkitError
@@ -127,6 +128,34 @@ class LocationType(click.ParamType[Location]):
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> Location:
         return located(value)
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        return [CompletionItem(incomplete, type="file")]
+
+
+def completed(names: Callable[[], Iterable[str]]) -> Callable[..., list[str]]:
+    """What a shell offers for an option: those of `names()` that begin as what is typed."""
+
+    def offered(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+        return [name for name in names() if name.startswith(incomplete)]
+
+    return offered
+
+
+def fitted_models() -> Iterable[str]:
+    """Models that can be fitted."""
+    from btfkit.materials import MODELS
+
+    return (name for name in MODELS if name != "composite")
+
+
+def source_formats() -> Iterable[str]:
+    """Formats that can be read."""
+    from btfkit.io import FORMATS
+
+    return FORMATS
 
 
 def out_option(what: str) -> Callable[..., Any]:

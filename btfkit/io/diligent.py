@@ -24,6 +24,8 @@ from btfkit.io.archive import Archive
 from btfkit.io.images.masks import read_mask
 from btfkit.io.lp import y_sign
 
+# A lamp of less, relative to the others, is no lamp; its reciprocal still has to be a float32.
+_FAINTEST = 1e-15
 _REQUIRED = ("light_directions.txt", "light_intensities.txt", "filenames.txt")
 
 
@@ -65,8 +67,10 @@ def read(
     light = _rows(holder, str(folder / "light_directions.txt"), len(names))
     light[:, 1] *= y_sign(values["orientation"])
     intensity = _rows(holder, str(folder / "light_intensities.txt"), len(names))
-    if (intensity <= 0).any():
-        raise FormatError(path, "light_intensities.txt holds one that is not above 0")
+    if not ((intensity > _FAINTEST) & (intensity < 1 / _FAINTEST)).all():
+        raise FormatError(
+            path, f"light_intensities.txt holds one that is not {_FAINTEST:g} to {1 / _FAINTEST:g}"
+        )
     scale = named.Product(
         named.Gains((1 / intensity).astype(np.float32)),
         named.cosine_factor(values["cosine"], light),

@@ -111,7 +111,8 @@ def load(path: Path, *, upward: bool = False) -> HSH:
         table = file.read(8 * terms)
     if len(table) < 8 * terms:
         raise FormatError(path, "ends within its scales", remedy="copy it again")
-    scale, bias = np.frombuffer(table, "<f4").astype(np.float64).reshape(2, terms)
+    with np.errstate(invalid="ignore"):  # numbers that signal: refused below
+        scale, bias = np.frombuffer(table, "<f4").astype(np.float64).reshape(2, terms)
     if not (np.isfinite(scale).all() and np.isfinite(bias).all()):
         raise FormatError(path, "a scale or bias is not finite")
     data = relit.mapped(path, after, (h, w, 3, terms))

@@ -67,7 +67,8 @@ def _check_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo)
         if version != (1, 0):
             header = np.lib.format.read_array_header_2_0
         shape, _, dtype = header(file)
-    size = math.prod(shape) * dtype.itemsize
+    # A side as well: of no values there may be two thousand million rows.
+    size = max(math.prod(shape) * dtype.itemsize, *shape, 0)
     if size > member.file_size or min(shape, default=0) < 0:
         raise FormatError(path, f"{member.filename} says {shape} of {dtype}, and holds less")
 
@@ -95,7 +96,10 @@ def _queries(path: Path, found: dict[str, NDArray[Any]]) -> QuerySet:
 
 def _channels(found: dict[str, NDArray[Any]], count: int) -> tuple[str, ...]:
     if "channels" in found:
-        return tuple(str(name) for name in found["channels"])
+        names = found["channels"]
+        if names.shape != (count,):
+            raise ValueError(f"channels of shape {names.shape} for rgb of {count}")
+        return tuple(str(name) for name in names)
     return ("R", "G", "B") if count == 3 else tuple(f"C{index}" for index in range(count))
 
 

@@ -241,7 +241,9 @@ class Material(ABC):
         """Lights drawn roughly as the material reflects them; shapes broadcast.
 
         Args:
-            uv, view, footprint: as `evaluate` takes them.
+            uv: as `evaluate` takes them, as are the views and footprints.
+            view: (..., 3).
+            footprint: (...).
             random: (..., 2) or (..., 3) numbers from 0 to 1, or a numpy Generator that draws
                 them. Of three the first chooses a lobe.
 
@@ -274,7 +276,8 @@ class Material(ABC):
         """How far answers for directions rest on measured pairs, anywhere on the sample.
 
         Args:
-            light, view: (..., 3) directions away from the surface; shapes broadcast.
+            light: (..., 3) directions away from the surface; shapes broadcast.
+            view: as `light`.
 
         Returns:
             (...) 1 where pairs were measured, towards 0 where answers are guessed; 0 for views
@@ -303,7 +306,8 @@ class Material(ABC):
 
         Args:
             uv: (..., 2) u in tile widths along +x, v in tile heights down the rows.
-            light, view: (..., 3) directions away from the surface; normalised here.
+            light: (..., 3) directions away from the surface; normalised here.
+            view: as `light`.
             footprint: (...) standard deviation of the Gaussian kernel, texels of the grid.
             curvature: (...) along the projected view ray, 1/tile width, positive convex.
             drift: (..., 4) side0, side1, skew0, skew1: how the ray's way through a body that is no

@@ -16,16 +16,18 @@ class Campaign:
 
     Attributes:
         where: `module:function` that prepares it.
+        sample: seeds of the sample that CI runs: five minutes of all campaigns on one core.
         share: of the time, beside the others.
         limit_s: CPU seconds a seed. limit_bytes: a seed; None where it starts processes.
-        root: whether it mounts disks.
+        mounts: whether it makes small disks, as only root may.
     """
 
     where: str
+    sample: int
     share: float = 1.0
     limit_s: float = LIMIT_S
     limit_bytes: int | None = LIMIT_BYTES
-    root: bool = False
+    mounts: bool = False
 
     @property
     def prepare(self) -> Callable[[Path], Attempt]:
@@ -36,11 +38,15 @@ class Campaign:
 
 
 CAMPAIGNS = {
-    "readers": Campaign("campaigns.inputs:readers", share=4),
-    "pictures": Campaign("campaigns.inputs:pictures", share=2),
-    "tables": Campaign("campaigns.inputs:tables", share=2),
-    "malice": Campaign("campaigns.malice:malice", share=2, limit_s=20),
-    "queries": Campaign("campaigns.queries:queries", share=4, limit_s=30, limit_bytes=None),
-    "kills": Campaign("campaigns.kills:kills", share=4, limit_s=300, limit_bytes=None),
-    "disks": Campaign("campaigns.kills:disks", share=2, limit_s=300, limit_bytes=None, root=True),
+    "readers": Campaign("campaigns.inputs:readers", sample=6000, share=4),
+    "pictures": Campaign("campaigns.inputs:pictures", sample=30000, share=2),
+    "tables": Campaign("campaigns.inputs:tables", sample=12000, share=2),
+    "malice": Campaign("campaigns.malice:malice", sample=300, share=2, limit_s=20),
+    "queries": Campaign(
+        "campaigns.queries:queries", sample=1000, share=4, limit_s=30, limit_bytes=None
+    ),
+    "kills": Campaign("campaigns.kills:kills", sample=45, share=4, limit_s=300, limit_bytes=None),
+    "disks": Campaign(
+        "campaigns.disks:disks", sample=48, share=2, limit_s=300, limit_bytes=None, mounts=True
+    ),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import time
 from pathlib import Path
@@ -26,7 +27,13 @@ def next_seed(name: str) -> int:
 
 
 def add(name: str, first: int, result: Result, seconds: float) -> None:
-    """Add a range of seeds, and write the table anew."""
+    """Add a range of seeds, and write the table anew; runs of other campaigns may do so at once."""
+    with DOCS.joinpath("campaigns.md").open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        _add(name, first, result, seconds)
+
+
+def _add(name: str, first: int, result: Result, seconds: float) -> None:
     held = read()
     entry = held.setdefault(name, {"next_seed": 0, "counts": {}, "seconds": 0.0, "finds": []})
     for key, value in result.counts.items():

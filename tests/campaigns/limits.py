@@ -24,8 +24,10 @@ LIMIT_S = 5.0
 LIMIT_BYTES = 1 << 30
 # A worker flushes its counts this often; what a crash takes with it is not counted.
 _FLUSH_S = 1.0
-# Looked at by wall clock only after the processor's: machines are shared.
-_WALL_FACTOR = 60
+# A worker that waits for nothing that comes uses no processor: asleep so many times the limit, it
+# hangs. One that waits for the processor itself is not asleep: machines are shared.
+_ASLEEP_FACTOR = 60
+_LOOK_S = 0.02
 
 
 class Find(AssertionError):  # noqa: N818
@@ -66,6 +68,14 @@ def _one_worker(
     prepare: Callable[[Path], Attempt], result: Result, last: int | None, end: float,
     limit_s: float, limit_bytes: int | None,
 ) -> None:  # fmt: skip
+    with _folder() as folder:
+        _in_folder(folder, prepare, result, last, end, limit_s, limit_bytes)
+
+
+def _in_folder(
+    folder: Path, prepare: Callable[[Path], Attempt], result: Result, last: int | None, end: float,
+    limit_s: float, limit_bytes: int | None,
+) -> None:  # fmt: skip
     shared = mmap.mmap(-1, 24)
     from_child, to_parent = os.pipe()
     sys.stdout.flush()
@@ -73,7 +83,7 @@ def _one_worker(
     if not child:
         os.close(from_child)
         try:
-            _worker(prepare, result.next_seed, last, end, limit_bytes, shared, to_parent)
+            _worker(folder, prepare, result.next_seed, last, end, limit_bytes, shared, to_parent)
         except BaseException:
             traceback.print_exc()
             os._exit(70)
@@ -81,7 +91,7 @@ def _one_worker(
     os.close(to_parent)
     os.set_blocking(from_child, False)
     buffer = b""
-    hung = None
+    hung, asleep = None, (0, 0.0)
     while True:
         with contextlib.suppress(BlockingIOError):
             while block := os.read(from_child, 1 << 16):
@@ -93,12 +103,11 @@ def _one_worker(
         if ended:
             break
         seed, since, cpu = struct.unpack("<qdd", shared[:24])
-        if since and (
-            _cpu_s(child) - cpu > limit_s or time.monotonic() - since > _WALL_FACTOR * limit_s
-        ):
+        asleep = seed, (asleep[1] if asleep[0] == seed else 0.0) + _LOOK_S * _sleeps(child)
+        if since and (_cpu_s(child) - cpu > limit_s or asleep[1] > _ASLEEP_FACTOR * limit_s):
             hung = seed
             os.kill(child, signal.SIGKILL)
-        time.sleep(0.02)
+        time.sleep(_LOOK_S)
     with contextlib.suppress(BlockingIOError):
         while block := os.read(from_child, 1 << 16):
             buffer += block
@@ -123,46 +132,59 @@ def _note(result: Result, line: dict[str, Any]) -> None:
     result.next_seed = line["next"]
 
 
+def _stat(process: int) -> list[str]:
+    """Of /proc: the state, and the fields behind it; none where there is no such process."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
+    return []
+
+
 def _cpu_s(process: int) -> float:
-    with contextlib.suppress(OSError, ValueError):
-        fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    return 0.0
+    fields = _stat(process)
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else 0.0
+
+
+def _sleeps(process: int) -> bool:
+    """Whether it waits for something else than the processor or a disk."""
+    return _stat(process)[:1] == ["S"]
 
 
 def _worker(
-    prepare: Callable[[Path], Attempt], first: int, last: int | None, end: float,
+    folder: Path, prepare: Callable[[Path], Attempt], first: int, last: int | None, end: float,
     limit_bytes: int | None, shared: mmap.mmap, to_parent: int,
 ) -> None:  # fmt: skip
-    with _folder() as folder:
-        attempt = prepare(folder)
-        if limit_bytes:
-            held = int(Path("/proc/self/statm").read_text().split()[0]) * mmap.PAGESIZE
-            resource.setrlimit(resource.RLIMIT_AS, (held + limit_bytes, resource.RLIM_INFINITY))
-        counts: Counter[str] = Counter()
-        finds: list[dict[str, Any]] = []
-        flushed = time.monotonic()
-        seed = first
-        while time.monotonic() < end and (last is None or seed < last):
-            cpu = _cpu_s(os.getpid())
-            shared[:24] = struct.pack("<qdd", seed, time.monotonic(), cpu)
-            try:
-                counts.update(attempt(seed))
-            except Find as find:
-                finds.append({"seed": seed, "what": " ".join(str(find).split())[:600]})
-            except MemoryError:
-                finds.append({"seed": seed, "what": f"more than {limit_bytes} bytes"})
-            except Exception as error:
-                where = traceback.extract_tb(error.__traceback__)[-1]
-                what = f"{type(error).__name__}: {error} at {where.filename}:{where.lineno}"
-                finds.append({"seed": seed, "what": " ".join(what.split())[:600]})
-            counts["tried"] += 1
-            seed += 1
-            if finds or time.monotonic() - flushed > _FLUSH_S:
-                _send(to_parent, counts, finds, seed)
-                counts, finds, flushed = Counter(), [], time.monotonic()
-        shared[:24] = struct.pack("<qdd", seed, 0.0, 0.0)
-        _send(to_parent, counts, finds, seed)
+    # What decoders say of each damaged picture would be a file of gigabytes.
+    sys.stderr = os.fdopen(os.dup(2), "w", buffering=1)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    attempt = prepare(folder)
+    if limit_bytes:
+        held = int(Path("/proc/self/statm").read_text().split()[0]) * mmap.PAGESIZE
+        resource.setrlimit(resource.RLIMIT_AS, (held + limit_bytes, resource.RLIM_INFINITY))
+    counts: Counter[str] = Counter()
+    finds: list[dict[str, Any]] = []
+    flushed = time.monotonic()
+    seed = first
+    while time.monotonic() < end and (last is None or seed < last):
+        cpu = _cpu_s(os.getpid())
+        shared[:24] = struct.pack("<qdd", seed, time.monotonic(), cpu)
+        try:
+            counts.update(attempt(seed))
+        except Find as find:
+            finds.append({"seed": seed, "what": " ".join(str(find).split())[:600]})
+        except MemoryError:
+            finds.append({"seed": seed, "what": f"more than {limit_bytes} bytes"})
+        except Exception as error:
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            what = f"{type(error).__name__}: {error} at {where.filename}:{where.lineno}"
+            finds.append({"seed": seed, "what": " ".join(what.split())[:600]})
+        counts["tried"] += 1
+        seed += 1
+        if finds or time.monotonic() - flushed > _FLUSH_S:
+            _send(to_parent, counts, finds, seed)
+            counts, finds, flushed = Counter(), [], time.monotonic()
+    shared[:24] = struct.pack("<qdd", seed, 0.0, 0.0)
+    _send(to_parent, counts, finds, seed)
 
 
 def _send(to: int, counts: Counter[str], finds: list[dict[str, Any]], seed: int) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
+from click.shell_completion import BashComplete
 
 from btfkit.btf import BTF
 from btfkit.cli import VERBS, btfkit
@@ -291,3 +292,24 @@ def test_a_light_behind_the_sample_is_a_black_picture_and_said_to_be_one(
     assert "no light reaches what is seen: the picture is black" in capsys.readouterr().err
     assert call(*asked, "--light", "20,0") == 0
     assert "black" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("typed", "incomplete", "offered"),
+    [
+        ([], "ren", [("plain", "render")]),
+        (["fit"], "--resu", [("plain", "--resume")]),
+        (["fit", "--model"], "neum", [("plain", "neumip"), ("plain", "neumip-paper")]),
+        (["bench", "--model"], "compo", []),
+        (["ingest", "--format"], "ubo20", [("plain", "ubo2003")]),
+        # The shell lists files itself.
+        (["fit"], "wo", [("file", "wo")]),
+        (["ingest", "wool.zip", "-o"], "wo", [("file", "wo")]),
+    ],
+)
+def test_a_shell_completes_verbs_options_names_and_files(
+    typed: list[str], incomplete: str, offered: list[tuple[str, str]]
+) -> None:
+    completion = BashComplete(btfkit, {}, "btfkit", "_BTFKIT_COMPLETE")
+    found = completion.get_completions(typed, incomplete)
+    assert [(item.type, item.value) for item in found] == offered

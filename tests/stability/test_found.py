@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 import pytest
 import sources
-import tifffile
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
@@ -28,7 +27,6 @@ from btfkit.io import archive, detect, images, queryfile
 from btfkit.materials import file as model_file
 from btfkit.materials.base import Header
 from btfkit.materials.lambert import Lambert, LambertSpec
-from btfkit.tifftags import chain_of
 
 
 def _npy(header: str, body: bytes = b"") -> bytes:
@@ -54,6 +52,12 @@ def _npy(header: str, body: bytes = b"") -> bytes:
             "uv.npy",
             _npy("{'descr': '|O', 'fortran_order': False, 'shape': (1, 2)}"),
             "holds less|not a readable",
+        ),
+        # No values, in rows that take a minute to go through.
+        (
+            "channels.npy",
+            _npy("{'descr': '<U1', 'fortran_order': False, 'shape': (2000000000, 0, 3)}"),
+            "holds less",
         ),
         # What is no array comes back from numpy as bytes.
         ("uv.npy", b"no array at all", "not a readable query file"),
@@ -178,6 +182,58 @@ def _direction(folder: Path) -> None:
     path.write_text(json.dumps(told))
 
 
+def _rotation(folder: Path) -> None:
+    path = folder / "sequence.json"
+    told = json.loads(path.read_text())
+    told["rig"]["camera"]["rotation"][0][2] = 1e12
+    path.write_text(json.dumps(told))
+
+
+def _no_rotation(folder: Path) -> None:
+    path = folder / "sequence.json"
+    told = json.loads(path.read_text())
+    told["rig"]["camera"]["rotation"] = [[2, 0, 0], [0, -2, 0], [0, 0, -2]]
+    path.write_text(json.dumps(told))
+
+
+def _away(folder: Path) -> None:
+    path = folder / "sequence.json"
+    told = json.loads(path.read_text())
+    told["rig"]["camera"]["rotation"] = np.eye(3).tolist()
+    path.write_text(json.dumps(told))
+
+
+def _name(folder: Path) -> None:
+    path = folder / "sequence.csv"
+    path.write_text(path.read_text().replace("frames/003.png", "frames/003.\x00g"))
+
+
+def _intensity(folder: Path) -> None:
+    path = folder / "light_intensities.txt"
+    path.write_text(path.read_text().replace("3 4 5", "3 1e-320 5"))
+
+
+def _signal(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    at = data.index(b"9 2 1\r\n") + 7
+    data[at : at + 4] = struct.pack("<I", 0x7F800001)
+    path.write_bytes(data)
+
+
+def _no_run(folder: Path) -> None:
+    path = folder / "texture" / "zarr.json"
+    told = json.loads(path.read_text())
+    told["chunk_grid"]["configuration"]["chunk_shape"][0] = 0
+    path.write_text(json.dumps(told))
+
+
+def _far(folder: Path) -> None:
+    path = folder / "sequence.json"
+    told = json.loads(path.read_text())
+    told["rig"]["axes"][0]["point_mm"] = [1e308, 0, 0]
+    path.write_text(json.dumps(told))
+
+
 def _shard(folder: Path) -> None:
     path = folder / "texture" / "zarr.json"
     told = json.loads(path.read_text())
@@ -199,6 +255,14 @@ def _frame(folder: Path) -> None:
         ("sequence", _direction, "has no direction"),
         ("zarr", _shard, "chunk|checksum|texture 0"),
         ("sequence", _frame, "cut short"),
+        ("sequence", _rotation, "expected three perpendicular unit vectors"),
+        ("sequence", _no_rotation, "expected three perpendicular unit vectors"),
+        ("sequence", _far, r"the camera of pair . lies at \[.*e\+30"),
+        ("sequence", _away, "no frame's camera sees the middle of the sample"),
+        ("sequence", _name, r"first: frames/003\.\\x00g\)"),
+        ("diligent", _intensity, "holds one that is not 1e-15 to"),
+        ("hsh", _signal, "a scale or bias is not finite"),
+        ("zarr", _no_run, "has shape|damaged"),
     ],
 )
 def test_what_lies_in_a_source_is_refused_by_name(
@@ -208,40 +272,6 @@ def test_what_lies_in_a_source_is_refused_by_name(
     change(source)
     with pytest.raises(BtfkitError, match=message):
         btfkit.open(source).texture(0)
-
-
-def test_a_bmp_whose_pixels_lie_in_its_palette_is_refused() -> None:
-    grey = cv2.imencode(".bmp", np.full((3, 4), 90, np.uint8))[1].tobytes()
-    assert images.read("a.bmp", grey, transfer="linear").shape[:2] == (3, 4)
-    data = bytearray(grey)
-    data[10:14] = struct.pack("<I", 54)
-    with pytest.raises(FormatError, match=f"pixels at byte 54 of {len(data)}; expected 1078 or"):
-        images.read("a.bmp", bytes(data), transfer="linear")
-
-
-@pytest.mark.parametrize("options", [{}, {"rowsperstrip": 6}, {"planarconfig": "separate"}])
-def test_a_tiff_with_fewer_strips_than_rows_is_refused(options: dict[str, object]) -> None:
-    shape = options == {"planarconfig": "separate"}
-    pixels = np.full((3, 20, 4) if shape else (20, 4, 3), 90, np.uint8)
-    buffer = io.BytesIO()
-    tifffile.imwrite(buffer, pixels, photometric="rgb", metadata=None, **options)
-    data = bytearray(buffer.getvalue())
-    assert images.read("a.tif", bytes(data), transfer="linear").shape == (20, 4, 3)
-    (directory,) = chain_of(bytes(data))
-    taller = directory.patched(257, 72)
-    with pytest.raises(FormatError, match=r"strips of .* rows for 72 rows; expected"):
-        images.read("a.tif", taller, transfer="linear")
-
-
-def test_a_tiff_without_a_size_is_refused() -> None:
-    buffer = io.BytesIO()
-    tifffile.imwrite(buffer, np.full((20, 4, 3), 90, np.uint8), photometric="rgb", metadata=None)
-    data = bytearray(buffer.getvalue())
-    (directory,) = chain_of(bytes(data))
-    at = directory._at[257]
-    data[at + 4 : at + 8] = bytes(4)
-    with pytest.raises(FormatError, match=r"a\.tif"):
-        images.read("a.tif", bytes(data), transfer="linear")
 
 
 def test_a_member_that_says_it_is_larger_than_its_archive_is_refused(tmp_path: Path) -> None:
@@ -264,4 +294,12 @@ def test_text_of_a_query_file_that_is_no_unicode_is_refused(tmp_path: Path) -> N
     text = np.frombuffer(b"\xff\xff\xff\x7f", "<U1").reshape(())
     np.savez(path, uv=up[:, :2], light=up, view=up, provenance=text)
     with pytest.raises(FormatError, match="holds text that cannot be read"):
+        queryfile.read(path)
+
+
+def test_channels_are_as_many_names_as_there_are_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "q.npz"
+    up = np.tile(np.float32([0, 0, 1]), (2, 1))
+    np.savez(path, uv=up[:, :2], light=up, view=up, rgb=up, channels=[["R", "G", "B"]])
+    with pytest.raises(FormatError, match=r"channels of shape \(1, 3\) for rgb of 3"):
         queryfile.read(path)

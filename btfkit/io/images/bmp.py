@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import struct
 
+import numpy as np
+
 from btfkit.errors import FormatError
 from btfkit.io.images import icc
 from btfkit.io.images.header import Header
@@ -41,7 +43,35 @@ def describe(name: str, data: bytes) -> Header:
             name, f"pixels at byte {pixels} of {len(data)}; expected {least} or later",
             remedy="copy it again, or save it as PNG",
         )  # fmt: skip
+    _check_indices(name, data, (h, w), pixels)
     return Header(h, w, colours=3, bits=8, declared=_declared(name, data))
+
+
+def _check_indices(name: str, data: bytes, size: tuple[int, int], pixels: int) -> None:
+    """Raise a FormatError where pixels name colours that the palette does not have.
+
+    Decoders make of those what they please. Runs are not unpacked for it: beside them the palette
+    has to be whole.
+    """
+    if struct.unpack_from("<I", data, 14)[0] == _CORE:
+        return
+    bits, coding = struct.unpack_from("<HI", data, 28)
+    (used,) = struct.unpack_from("<I", data, 46)
+    if bits not in (1, 4, 8) or not used or used >= 1 << bits:
+        return
+    most = (1 << bits) - 1
+    if not coding:
+        h, w = size
+        stride = (w * bits + 31) // 32 * 4
+        rows = np.frombuffer(data, np.uint8, offset=pixels)[: h * stride]
+        rows = rows[: len(rows) // stride * stride].reshape(-1, stride)
+        codes = np.unpackbits(rows, axis=1).reshape(len(rows), -1, bits)[:, :w]
+        most = int(np.packbits(codes, axis=-1).max(initial=0)) >> (8 - bits)
+    if most >= used:
+        raise FormatError(
+            name, f"a palette of {used} colours for pixels up to {most}",
+            remedy="copy it again, or save it as PNG",
+        )  # fmt: skip
 
 
 def _palette_bytes(data: bytes, length: int) -> int:

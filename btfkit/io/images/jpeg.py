@@ -13,6 +13,7 @@ from btfkit.io.images.profiles import ADOBE_RGB, Declared
 # Markers that start a frame (SOF0 to SOF15, not DHT, JPG, DAC), and those without a body.
 FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 # Baseline, extended and progressive with Huffman codes; extended and progressive arithmetic.
+_ARITHMETIC = 0xC9
 _DECODED = {0xC0, 0xC1, 0xC2, 0xC9, 0xCA}
 _BARE = {0x01, *range(0xD0, 0xD8)}
 _SCAN, _END, _EXIF, _ICC = 0xDA, 0xD9, 0xE1, 0xE2
@@ -51,6 +52,10 @@ def describe(name: str, data: bytes) -> Header:
                 precision, h, w, components = struct.unpack_from(">BHHB", data, at + 2)
                 frame = (h, w, components, precision)
                 _check_kind(name, marker, precision, components)
+                # Huffman's codes take a bit at least, of each 8 x 8 pixels; twice that is left for
+                # components of odd shapes. Decoders fill what is missing with grey.
+                if marker < _ARITHMETIC and h * w > 1024 * len(data):
+                    raise ValueError("blocks without a code")
             elif marker in (_EXIF, _ICC):
                 blocks.append((marker, data[at + 2 : _behind(data, marker, at)]))
             at = _behind(data, marker, at)

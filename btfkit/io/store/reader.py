@@ -142,7 +142,7 @@ class StoreTextures(Textures):
         shape = array.shape
         if (
             len(shape) != 4
-            or min(shape) < 1
+            or min(*shape, *(array.shards or array.chunks)) < 1
             or int(np.prod(shape[1:], dtype=object)) > _MOST_VALUES
             or shape[0] > _MOST_PAIRS
         ):
