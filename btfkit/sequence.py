@@ -11,6 +11,7 @@ find, that stage names. docs/capture.md has every column and key.
 from __future__ import annotations
 
 import hashlib
+import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -164,7 +165,10 @@ class Sequence:
         try:
             data = path.read_bytes()
         except OSError as error:
-            raise FormatError(path, f"cannot be read ({error.strerror})") from error
+            raise FormatError(
+                path, f"cannot be read ({error.strerror})",
+                remedy=f"copy it again, or take its line out of {TABLE}",
+            ) from error  # fmt: skip
         if frame.sha256 is not None and hashlib.sha256(data).hexdigest() != frame.sha256:
             raise FormatError(
                 path, f"is not the file that {TABLE} lists: its SHA-256 differs",
@@ -179,6 +183,22 @@ class Sequence:
                 remedy=f"correct sensor in {DOCUMENT}, or leave the frame out of {TABLE}",
             )  # fmt: skip
         return image
+
+
+def refuse_unended(folder: Path) -> None:
+    """Refuse the folder of a run that our own engine has begun and not ended.
+
+    Raises:
+        FormatError: says how to go on with it.
+    """
+    begun = all((folder / name).is_file() for name in ("journal.jsonl", "plan.json"))
+    if begun and not (folder / TABLE).is_file():
+        device = "mock" if (folder / "twin.jsonl").is_file() else "usb"
+        raise FormatError(
+            folder, "a run of captures that has not ended",
+            remedy=f"btfkit capture --device {device} --resume -o {shlex.quote(str(folder))} goes "
+            "on with it",
+        )  # fmt: skip
 
 
 def save(

@@ -80,7 +80,10 @@ def test_a_folder_that_no_reader_knows_says_what_it_is(tmp_path):
         io.detect(tmp_path)
     for name in ("journal.jsonl", "plan.json"):
         (tmp_path / name).touch()
-    with pytest.raises(
-        FormatError, match="a run of captures that has not ended; btfkit capture --"
-    ):
-        io.detect(tmp_path)
+    for twin, device in (("note.txt", "usb"), ("twin.jsonl", "mock")):
+        (tmp_path / twin).touch()
+        again = (
+            f"a run of captures that has not ended; btfkit capture --device {device} --resume -o"
+        )
+        with pytest.raises(FormatError, match=again):
+            io.detect(tmp_path)

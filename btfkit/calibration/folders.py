@@ -64,8 +64,9 @@ def calibrate_sequence(
     found.save(final, force=True)
     lights = _lights(sequence)
     report.write_report(found, page, title=folder.resolve().name, lights=lights, force=True)
+    gone = [frame.file for frame in sequence.frames if not (folder / frame.file).is_file()]
     return {
-        "out": final, "report": page, "ran": ran, "missing": dict(found.missing),
+        "out": final, "report": page, "ran": ran, "missing": dict(found.missing), "gone": gone,
         "figures": figures(found),
         **(_preview(final, lights) if preview and lights is not None else {}),
     }  # fmt: skip
@@ -78,6 +79,9 @@ def figures(found: Calibration) -> dict[str, Any]:
         noise = found.sections["radiometry"].data["noise"]
         out |= {"photon_noise": noise["gain_e_per_count"] < NOISELESS_GAIN}
         out |= {"gain_e_per_count": noise["gain_e_per_count"], "read_e": noise["read_e"]}
+    if "geometry" in found.sections:
+        residuals = found.sections["geometry"].data["residuals_px"]
+        out |= {f"{kind}_px": rms for kind, rms in residuals.items()}
     if "lamp" in found.sections:
         out["lamp_drift"] = found.sections["lamp"].data["drift"]
     if "stray" in found.sections:

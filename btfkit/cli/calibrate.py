@@ -88,7 +88,7 @@ def _calibrated(
     """Calibrate one folder."""
     from btfkit.calibration.calibration import NAME
     from btfkit.calibration.folders import Photographs, calibrate_photographs, calibrate_sequence
-    from btfkit.sequence import TABLE
+    from btfkit.sequence import TABLE, refuse_unended
 
     if not source.is_dir():
         raise FileNotFoundError(f"{source} is not a folder")
@@ -99,6 +99,7 @@ def _calibrated(
         if data["out"] != source / NAME:
             then += f" --calibration {shlex.quote(str(data['out']))}"
         return Outcome(_of_sequence(data), data, then=then)
+    refuse_unended(source)
     how = Photographs(**options)
     data = calibrate_photographs(source, out, how, force=force, progress=bar, preview=preview)
     return Outcome(_of_lights(data), data, then=f"btfkit ingest {shlex.quote(str(data['out']))}")
@@ -111,6 +112,8 @@ def _of_sequence(data: dict[str, Any]) -> str:
         parts = [
             f"gain {found['gain_e_per_count']:.3f} e/count, read noise {found['read_e']:.2f} e"
         ]
+    if "corner_px" in found:
+        parts.append(f"corners {found['corner_px']:.3f} px")
     if "lamp_drift" in found:
         parts.append(f"lamp drift {100 * found['lamp_drift']:.2f} %")
     if "scale_sd" in found:
@@ -119,6 +122,9 @@ def _of_sequence(data: dict[str, Any]) -> str:
         parts.append(f"dE2000 {found['delta_e']:.2f}")
     lines = [f"{data['out']}: {', '.join(parts)}"]
     lines.append(f"  ran {', '.join(data['ran']) or 'nothing: all inputs are unchanged'}")
+    if data["gone"]:
+        gone = f"{len(data['gone'])} listed frames are not there (first: {data['gone'][0]})"
+        lines.append(f"  {gone}; what was made of them before is kept")
     lines += [f"  missing {name}: {why}" for name, why in data["missing"].items()]
     return "\n".join(lines)
 

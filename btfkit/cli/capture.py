@@ -142,13 +142,22 @@ def _rehearsed(plan: Plan, driver: str, twin: Twin | None, where: str) -> Outcom
     order = [step.pair for step in steps if step.pair is not None]
     line = (
         f"{plan.name}: {found['poses']:.0f} poses, at most {found['frames']:.0f} frames, about "
-        f"{found['seconds'] / 3600:.1f} h (of which {found['travel_s'] / 3600:.1f} h of travel), "
-        f"at most {found['bytes'] / 1e9:.1f} GB\n"
+        f"{_span(found['seconds'])} (of which {_span(found['travel_s'])} of travel), at most "
+        f"{_size(found['bytes'])}\n"
         + ", ".join(f"{count} {kind}" for kind, count in kinds.items())
         + f"\nfirst pairs: {', '.join(map(str, order[:12]))}"
     )
     return Outcome(line, {"plan": plan.name, "hash": plan.hash, **found, "kinds": kinds,
                           "order": order})  # fmt: skip
+
+
+def _span(seconds: float) -> str:
+    """A time as one plans with it."""
+    return f"{seconds / 3600:.1f} h" if seconds >= 7200 else f"{seconds / 60:.0f} min"
+
+
+def _size(count: float) -> str:
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
 def _measured(

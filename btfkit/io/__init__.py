@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
-import shlex
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 from btfkit.btf import BTF
 from btfkit.errors import FormatError, unknown
 from btfkit.remote import Remote, located
+from btfkit.sequence import refuse_unended
 
 # The order is the order of detection: the more specific first.
 FORMATS: dict[str, str] = {
@@ -68,9 +68,7 @@ def detect(path: str | os.PathLike[str] | Remote) -> str:
             return name
     if source.is_dir() and not any(source.iterdir()):
         raise FormatError(source, "the folder is empty")
-    if (source / "journal.jsonl").is_file() and (source / "plan.json").is_file():
-        again = f"btfkit capture --resume -o {shlex.quote(str(source))} goes on with it"
-        raise FormatError(source, "a run of captures that has not ended", remedy=again)
+    refuse_unended(source)
     what = f"no reader knows this {'folder' if source.is_dir() else 'file'}"
     remedy = f"formats are {', '.join(FORMATS)}; btfkit ingest --format names one"
     photographs = _photographs(source)

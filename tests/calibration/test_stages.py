@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from dataclasses import replace
@@ -467,7 +468,26 @@ def test_the_verb_calibrates_a_sequence_and_keeps_what_it_knows(folder, capsys):
     said = capsys.readouterr()
     assert "nothing: all inputs are unchanged" in said.out
     assert f"next: btfkit ingest {folder}\n" in said.err
+    sequence = Sequence.open(folder)
+    dark = folder / sequence.frames[sequence.of_kind("dark")[0]].file
+    dark.rename(dark.with_suffix(".away"))
+    assert call("calibrate", folder) == 1
+    assert f"{dark.name}: cannot be read" in capsys.readouterr().err
+    dark.with_suffix(".away").rename(dark)
+    # Where the table has hashes it tells what was read, whatever became of the files since.
+    hashes = [hashlib.sha256((folder / f.file).read_bytes()).hexdigest() for f in sequence.frames]
+    told = [replace(f, sha256=h) for f, h in zip(sequence.frames, hashes, strict=True)]
+    save(folder, told, sequence.document, force=True)
+    dark.unlink()
+    assert call("calibrate", folder) == 0
+    said = capsys.readouterr().out
+    assert "ran nothing" in said
+    assert f"1 listed frames are not there (first: frames/{dark.name})" in said
+    dark.write_bytes(counts.encode_png(sequence.image(sequence.of_kind("dark")[1])))
     out = folder.parent / "other.json"
+    assert call("calibrate", folder, "-o", out, "--force") == 1
+    assert "its SHA-256 differs" in capsys.readouterr().err
+    save(folder, sequence.frames, sequence.document, force=True)
     assert call("calibrate", folder, "-o", out) == 0
     # What lies elsewhere is named to be read along with the sequence.
     assert f"next: btfkit ingest {folder} --calibration {out}\n" in capsys.readouterr().err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +63,21 @@ def test_a_dry_run_says_order_time_and_storage_and_writes_nothing(capsys, tmp_pa
     assert result["seconds"] > result["travel_s"] > 3600
     # 26 244 frames of the sample alone, 640 x 480 at two bytes.
     assert result["bytes"] >= 26244 * 640 * 480 * 2
+    assert call("capture", "--device", "mock", "--plan", "demo", "--dry-run") == 0
+    assert re.search(
+        r"about \d+ min \(of which \d+ min of travel\), at most \d+ MB", capsys.readouterr().out
+    )
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_was_killed_is_named_by_whoever_reads_it(capsys, tmp_path):
+    (tmp_path / "run").mkdir()
+    for name in ("journal.jsonl", "plan.json", "twin.jsonl"):
+        (tmp_path / "run" / name).touch()
+    for verb in ("calibrate", "ingest", "info"):
+        assert call(verb, tmp_path / "run") == 1
+        said = capsys.readouterr().err
+        assert "a run of captures that has not ended; btfkit capture --device mock --resume" in said
 
 
 @pytest.mark.parametrize(
