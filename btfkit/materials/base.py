@@ -423,9 +423,7 @@ class Material(ABC):
         _warn_of_masked(m * b - int(lights.good.sum()) * int(np.count_nonzero(seen)), m * b)
         return Response(rgb.reshape(*shape, c), opacity.reshape(shape))
 
-    def _answer_block(
-        self, query: Query, drift: Array | None, rgb: Array, opacity: Array
-    ) -> int:
+    def _answer_block(self, query: Query, drift: Array | None, rgb: Array, opacity: Array) -> int:
         """Answer one block into `rgb` and `opacity`; returns how many are masked."""
         ready, drift = self._ready(query, drift, opacity, below=self.full_sphere)
         if ready.rows is not None:

@@ -122,7 +122,11 @@ def _towards_foot(found: Surface, up: Floats, depth: Floats) -> Floats:
     y = np.cross(found.normal, x)
     gap = found.normal - up
     a, b = np.einsum("ij,ij->i", gap, x), np.einsum("ij,ij->i", gap, y)
-    xx, xy, yy = 1 - depth * found.bend[:, 0], -depth * found.bend[:, 1], 1 - depth * found.bend[:, 2]
+    xx, xy, yy = (
+        1 - depth * found.bend[:, 0],
+        -depth * found.bend[:, 1],
+        1 - depth * found.bend[:, 2],
+    )
     area = xx * yy - xy**2
     # Below the axis of curvature there is no foot.
     known = (area > _LEAST_AREA) & (xx > 0)

@@ -58,9 +58,7 @@ def answer(
     """
     if program.cover is not None:
         return _covered(program, program.cover, uv, light, view, footprint, curvature)
-    raw, scaled, (opacity, lit) = _last_layer(
-        program, uv, light, view, footprint, curvature, drift
-    )
+    raw, scaled, (opacity, lit) = _last_layer(program, uv, light, view, footprint, curvature, drift)
     heads = _heads(program, raw)
     if "opacity" in heads:
         opacity = _sigmoid(heads["opacity"][:, 0])
