@@ -142,11 +142,11 @@ def on_torus(name: str, asked: Asked) -> dict[str, Any]:
     relief, size = torus_relief(name, asked.size), asked.size
     truth = torus_outline(relief)
     start = time.process_time()
-    curved = queries_of(relief, seed=1, a_texel=A_TEXEL)
+    curved = queries_of(relief, seed=1)
     traced = time.process_time() - start
     sources = {"found": (curved, True)}
     if not asked.brief:
-        plane = random_queries(relief, A_TEXEL * size**2, seed=1, samples=4)
+        plane = random_queries(relief, 2 * A_TEXEL * size**2, seed=1, samples=4)
         sources |= {"plane": (plane, True), "curved": (curved, False)}
     models = {
         label: fitted(data, "sbtf", asked, levels=1, looks=asked.looks, outlines=outlines)

@@ -310,11 +310,11 @@ def cost() -> Rows:
         curvature = bend if np.isscalar(bend) else bend[rows]
         model.evaluate(query.uv[rows], above[rows], query.view[rows], 0.5, curvature)
 
-    uv, view, bend = _pictured(material)
+    uv, view, bend, drift = _pictured(material)
     towards = np.ascontiguousarray(np.broadcast_to(np.float32([0, 0, 1]), view.shape))
 
-    def see(model: Material, curvature: Any) -> None:
-        model.evaluate(uv, towards, view, 0.5, curvature)
+    def see(model: Material, curvature: Any, off: Any = None) -> None:
+        model.evaluate(uv, towards, view, 0.5, curvature, off)
 
     lights = above[:8, None]
     passes = np.flatnonzero(material.evaluate(*query).opacity == 0)
@@ -323,7 +323,7 @@ def cost() -> Rows:
         "sbtf, plane": (lambda: ask(material, 0.0), len(above)),
         "sbtf, gently curved": (lambda: ask(material, told), len(above)),
         "neumip, torus": (lambda: see(flat, 0.0), len(uv)),
-        "sbtf, torus": (lambda: see(material, bend), len(uv)),
+        "sbtf, torus": (lambda: see(material, bend, drift), len(uv)),
         "sbtf, cylinders": (lambda: ask(material, query.curvature), len(above)),
         "sbtf, rays that pass": (lambda: ask(material, query.curvature, passes), len(passes)),
         "sbtf, cylinders, 8 lights": (
@@ -344,8 +344,8 @@ def cost() -> Rows:
     }
 
 
-def _pictured(material: SBTF) -> tuple[Floats, Floats, Floats]:
-    """uv, view and curvature of a torus' pixels in their order, which neighbours share."""
+def _pictured(material: SBTF) -> tuple[Floats, ...]:
+    """uv, view, curvature and drift of a torus' pixels in their order, which neighbours share."""
     shape = Torus(tube=0.25, tiles=(6, 2))
     origin, direction, beyond = _camera_rays(shape)
     met = shape.meet(origin, direction, beyond)
@@ -354,9 +354,8 @@ def _pictured(material: SBTF) -> tuple[Floats, Floats, Floats]:
     surface = shape.surface(origin[hit], direction[hit], met)
     pixel = np.stack([direction[0], direction[0]]) * 0
     seen = gaze(material, shape, surface, -direction[hit], pixel)
-    return (
-        seen.uv.astype(np.float32), seen.view.astype(np.float32), seen.curvature.astype(np.float32)
-    )  # fmt: skip
+    parts = seen.uv, seen.view, seen.curvature, seen.drift
+    return tuple(part.astype(np.float32) for part in parts)
 
 
 PARTS: dict[str, Callable[[], Rows]] = {

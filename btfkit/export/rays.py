@@ -21,6 +21,8 @@ from btfkit.program import Heights
 
 # A texture (h, w, k) at places (b, 2).
 Lookup = Callable[[NDArray[Any], Value], Value]
+# Above every height.
+_FAR = 1e30
 
 
 class Met(NamedTuple):
@@ -96,7 +98,8 @@ def on_curved(
     else:
         texels, limit = texels * CURVED_FINER, float(found.looks)
     count = texels.of("Ceil").at_least(1.0).at_most(limit)
-    way, under = _march(start, reach, count, above, most, limited=True)
+    again = reaches.of("Not") if holes is None else count > 0.0
+    way, under = _march(start, reach, count, above, most, again=again)
     ended = (under > 0.0).of("Not")
     opaque = ended if holes is not None else reaches | ended
     way = opaque.where(way, start + reach)
@@ -121,14 +124,16 @@ def _march(
     above: Callable[[Value], Value],
     most: int,
     *,
-    limited: bool = False,
+    again: Value | None = None,
 ) -> tuple[Value, Value]:
     """Where rays first are under what they are above at the start, and the gap at the last look.
 
     Args:
-        limited: whether a ray stops after `count` looks although it met nothing.
+        again: rays that may pass, which then end after `count` looks: three more are taken around
+            the one that is the least above the surface. None where all are stopped.
     """
-    low = high = start
+    low = high = near = start
+    least = start * 0.0 + _FAR
     gap = under = above(low)
     going: Value | None = None
     for k in range(1, most + 1):
@@ -141,8 +146,26 @@ def _march(
             high, gap = going.where(low, high), going.where(under, gap)
             low, under = going.where(to, low), going.where(found, under)
             going = going & (found > 0.0)
-        if limited:
+        if again is not None:
             going = going & (count > float(k))
+            nearer = going & (found < least)
+            near, least = nearer.where(to, near), nearer.where(found, least)
+    if again is not None:
+        passes = again & (under > 0.0) & (least < _FAR)
+        half = reach / count * 0.5
+        before, after = above(near - half), above(near + half)
+        ahead = after < before
+        side = near + ahead.where(half, half * -1.0) * 0.5
+        beside = above(side)
+        # The last counts: what is nearest to the viewer.
+        for at, there, since, was in (
+            (near + half, after, near, least),
+            (side, beside, ahead.where(near, near - half), ahead.where(least, before)),
+            (near - half, before, near - half * 2.0, least),
+        ):
+            hit = passes & (there > 0.0).of("Not")
+            low, under = hit.where(at, low), hit.where(there, under)
+            high, gap = hit.where(since, high), hit.where(was, gap)
     first = _met(high, low, gap, under)
     rest = above(first)
     short = rest > 0.0

@@ -413,3 +413,36 @@ def test_holes_and_thickness_are_found_in_queries() -> None:
         fit(silent, model="sbtf", steps=1, settings={"holes": "true"})
     thick = fit(queries, model="sbtf", steps=1, settings={"thickness": 0.08, "batch": 512}).material
     assert thick.thickness == pytest.approx(0.08, rel=1e-3)
+
+
+def test_drift_is_checked_masked_and_held() -> None:
+    material, query = random_sbtf(relief().height), on_cylinders(300)
+    off = np.tile(np.float32([0.2, -0.1, 0.3, 0.1]), (300, 1))
+    rgb, opacity = material.evaluate(*query, off)
+    shared = material.evaluate(*query, off[0])
+    np.testing.assert_array_equal(rgb, shared.reflectance)
+    assert (opacity != material.evaluate(*query).opacity).any()
+    with pytest.raises(ValueError, match=r"drift has shape \(300, 3\); expected \(\.\.\., 4\)"):
+        material.evaluate(*query, off[:, :3])
+    with pytest.raises(ValueError, match=r"drift has leading shape \(7,\); the other parts have"):
+        material.evaluate(*query, off[:7])
+    off[:5, 2] = np.nan
+    off[5:9] = 1e30
+    with pytest.warns(UserWarning, match="5 of 300 queries are not finite"):
+        bad = material.evaluate(*query, off)
+    assert not bad.opacity[:5].any()
+    off[5:9] = 8
+    np.testing.assert_array_equal(
+        bad.opacity[5:9], material.evaluate(*(p[5:9] for p in query), off[5:9]).opacity
+    )
+    np.testing.assert_array_equal(bad.reflectance[9:], rgb[9:])
+    # Under several lights, and by the twin, the same.
+    lights = np.stack([query.light, query.light])
+    off = off[9:]
+    part = Query(*(p[9:] for p in query))
+    both = material.under_lights(
+        part.uv, np.ascontiguousarray(lights[:, 9:]), part.view, part.footprint, part.curvature, off
+    )
+    np.testing.assert_array_equal(both.opacity, opacity[9:])
+    # Directions of length 1 are normalised once more.
+    np.testing.assert_allclose(both.reflectance[1], rgb[9:], rtol=1e-4, atol=1e-5)

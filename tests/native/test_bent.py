@@ -373,3 +373,86 @@ def test_a_flat_sheet_has_holes_and_no_leaks():
             )  # fmt: skip
             reaches = bent.rays_of(heights, view, np.full(500, np.float32(bend)), 1.0).reaches
             assert whole.opacity[reaches].all()
+
+
+def drifts(rng, count):
+    """As wide as torus and meshes have them."""
+    return (rng.uniform(-1, 1, (count, 4)) * [0.3, 0.3, 0.8, 0.4]).astype(np.float32)
+
+
+@compiled
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("name", ["levels", "clamped", "holes", "clamped holes"])
+def test_rays_that_drift_end_in_the_kernel_as_in_its_twin(name, variant):
+    case, rng = CASES[name], np.random.default_rng(13)
+    weights, texels = parameters(case, rng, top=0.3)
+    uv, light, view, footprint, curvature = parts = queries(case, rng)
+    off, ends, programs = drifts(rng, len(uv)), [], []
+    for kind in (np.float32, np.float64):
+        programs.append(case.program(weights.astype(kind), texels.astype(kind)))
+        own = (p.astype(kind) for p in (uv, view, curvature, off))
+        ends.append(plain._ended(programs[-1], *own))
+    (single, first, _, _), (double, second, _, beside) = ends
+    good = (np.abs(single - double) < 1e-6 + 1e-4 * np.abs(double)) & (first == second)
+    assert good.mean() > 0.97
+    assert np.abs(beside).max() > 0.02
+    wanted, _ = plain.answer(programs[0], *parts, off)
+    straight = plain.answer(programs[0], *parts)[1]
+    assert (straight != first).mean() > 0.01
+    for frozen in (False, True):
+        kernel, opacity = Kernel(case, variant=variant), np.empty(len(uv), np.float32)
+        if frozen:
+            kernel.freeze(texels)
+        found = kernel.evaluate(weights, texels, *parts, opacity=opacity, drift=off)
+        # Frozen heights are in steps of 1/65535 of their range: a ray that grazes may pass.
+        assert (opacity != second)[good].mean() <= (0.004 if frozen else 0)
+        same = good & (opacity == second)
+        # Random textures, in which a place aside is off by a rounding of uv.
+        assert relative(found[same], wanted[same]) < (5e-3 if frozen else 3e-3)
+        shared = np.empty_like(opacity)
+        under = kernel.evaluate_lights(
+            weights, texels, uv, light[:2].copy(), view, footprint, curvature, opacity=shared,
+            drift=off,
+        )  # fmt: skip
+        np.testing.assert_array_equal(shared, opacity)
+        alone = kernel.evaluate(weights, texels, uv, np.tile(light[1], (len(uv), 1)), *parts[2:],
+                                drift=off)  # fmt: skip
+        np.testing.assert_array_equal(under[1], alone)
+
+
+@compiled
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_no_drift_is_the_circle_to_the_bit_and_only_convex_rays_drift(variant):
+    case, rng = CASES["levels"], np.random.default_rng(14)
+    weights, texels = parameters(case, rng)
+    parts = queries(case, rng)
+    kernel = Kernel(case, variant=variant)
+    kernel.freeze(texels)
+    circle = kernel.evaluate(weights, texels, *parts)
+    none = np.zeros((len(parts[0]), 4), np.float32)
+    np.testing.assert_array_equal(kernel.evaluate(weights, texels, *parts, drift=none), circle)
+    off = drifts(rng, len(none))
+    found = kernel.evaluate(weights, texels, *parts, drift=off)
+    flat = parts[4] <= 0
+    np.testing.assert_array_equal(found[flat], circle[flat])
+    assert (found[~flat] != circle[~flat]).any()
+
+
+def test_a_wall_between_two_looks_is_found_where_the_ray_passes_closest_by():
+    # A ridge of two texels, of which twelve looks over some forty half texels miss most.
+    heights = np.full((1, 64), np.float32(-1))
+    heights[0, 20:23] = -0.5, 0.0, -0.5
+    found = Heights(heights, 0.1, True)
+    count, rng = 2000, np.random.default_rng(15)
+    uv, z = rng.random((count, 2)), rng.uniform(0.2, 0.35, count)
+    view = np.stack([-np.sqrt(1 - z * z), 0 * z, z], axis=1)
+    bend = np.full(count, 1.0)
+    dense = bent.meet(replace(found, looks=400), uv, view, bend, aspect=1.0, wrap=True)
+    few = bent.meet(found, uv, view, bend, aspect=1.0, wrap=True)
+    assert 0.2 < dense.opacity.mean() < 0.9
+    # Of the looks alone it would be a third.
+    assert (few.opacity != dense.opacity).mean() < 0.12
+    both = (few.opacity > 0) & (dense.opacity > 0)
+    # Of the first crossing, not of the far side of the ridge: within the ridge of two texels.
+    off = np.abs(few.way - dense.way)[both] * 0.1 * 64
+    assert (off < 2).mean() > 0.98

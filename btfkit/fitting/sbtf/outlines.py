@@ -25,6 +25,9 @@ _LOOKS, _CARVED, _SHARE, _LARGE_SHARE = 24, 32, 0.2, 0.5
 _NOTHING = 0.01
 # Sweeps over rays that may pass, and rays of each a texel.
 _SWEEPS, _SWEPT, _MOST_SWEPT = 20, 5, 1 << 17
+# Share of the depth by which heights sink before the first sweep; before later ones ever less. What
+# no ray that was stopped holds up would stay as high as rays that passed let it.
+_SINKING = 0.012
 
 
 def carved(
@@ -64,7 +67,8 @@ def carved(
     heights = np.clip(heights, bottom, 0)
     band = convex[lowest[convex] <= -bottom]
     rng, count = np.random.default_rng(seed), min(_SWEPT * heights.size, _MOST_SWEPT, len(band))
-    for _ in range(_SWEEPS):
+    for k in range(_SWEEPS):
+        heights = heights + np.float32(_SINKING * bottom * (1 - k / _SWEEPS))
         rows = rng.choice(band, count, replace=False)
         heights = heights + moved(
             Heights(heights, scale, curved=True), queries.uv[rows], queries.view[rows],

@@ -62,7 +62,7 @@ struct Surface {
     bool wrap;
     const float* opacity;  // of the heights, or null
     int looks;             // at most along a ray that may pass
-    const uint64_t *quads, *cover_quads;  // the same as `Quads`, or null
+    const Quads *quads, *cover_quads;  // the same, or null
 
     MEMBER Corners around(F u, F v) const {
         return corners_of(u, v, all(w), all(h), I{}, wrap);
@@ -74,8 +74,8 @@ struct Surface {
         if (quads) {
             F fx, fy;
             const I at = quad_at(u, v, fx, fy);
-            height = bottom + (top - bottom) / kQuadMost * read_quad(quads, at, fx, fy);
-            if (opacity) cover = 1.f / kQuadMost * read_quad(cover_quads, at, fx, fy);
+            height = read_quad(*quads, at, fx, fy);
+            if (opacity) cover = read_quad(*cover_quads, at, fx, fy);
         } else {
             const Corners c = around(u, v);
             height = read(heights, c);
@@ -110,17 +110,16 @@ struct Surface {
         const U last = U{} + uint32_t((int32_t(w) + 1) * (int32_t(h) + 1) - 1);
         return (I)((U)at < last ? (U)at : last);
     }
-    // 0 to kQuadMost.
-    MEMBER F read_quad(const uint64_t* from, I at, F fx, F fy) const {
+    MEMBER F read_quad(const Quads& from, I at, F fx, F fy) const {
         I upper, lower;
-        gathered_halves(from, at, upper, lower);
+        gathered_halves(from.at.data(), at, upper, lower);
         typedef uint32_t U __attribute__((vector_size(sizeof(I)), may_alias));
         const F a = __builtin_convertvector(lower & 0xffff, F);
         const F b = __builtin_convertvector((I)((U)lower >> 16), F);
         const F c = __builtin_convertvector(upper & 0xffff, F);
         const F d = __builtin_convertvector((I)((U)upper >> 16), F);
         const F first = a + (b - a) * fx, second = c + (d - c) * fx;
-        return first + (second - first) * fy;
+        return from.low + from.step * (first + (second - first) * fy);
     }
     MEMBER F read(const float* from, const Corners& c) const {
         F h[4];

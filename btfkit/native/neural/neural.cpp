@@ -183,10 +183,9 @@ class Model {
         frozen_ = true;
         if (!plan_.curved) return;
         const int h = plan_.heights.h, w = plan_.heights.w;
-        quads_ = quads_of(t.data(), h, w, plan_.wrap, bottom_, top_);
-        if (!plan_.holes) return;
-        const float* cover = t.data() + plan_.plane() * kChannels;
-        cover_quads_ = quads_of(cover, h, w, plan_.wrap, 0.f, 1.f);
+        quads_ = Quads(t.data(), h, w, plan_.wrap);
+        if (plan_.holes)
+            cover_quads_ = Quads(t.data() + plan_.plane() * kChannels, h, w, plan_.wrap);
     }
 
     int64_t weights() const { return int64_t(plan_.weights()); }
@@ -370,8 +369,8 @@ class Model {
         if (frozen_) {
             b.top = top_;
             b.bottom = bottom_;
-            b.quads = quads_.empty() ? nullptr : quads_.data();
-            b.cover_quads = cover_quads_.empty() ? nullptr : cover_quads_.data();
+            b.quads = quads_.at.empty() ? nullptr : &quads_;
+            b.cover_quads = &cover_quads_;
             return;
         }
         float top = -INFINITY, bottom = INFINITY;
@@ -393,7 +392,7 @@ class Model {
     Plan plan_;
     bool frozen_ = false;
     float top_ = 0, bottom_ = 0;
-    std::vector<uint64_t> quads_, cover_quads_;
+    Quads quads_, cover_quads_;
     std::vector<std::vector<float>> weights_;
     std::vector<Zeros> texels_;
     std::vector<std::vector<uint8_t>> touched_;

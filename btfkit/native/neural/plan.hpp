@@ -157,22 +157,28 @@ constexpr float kQuadMost = 65535.f;
 // A plane of numbers for marches, which look at many: the four around each place, 16 bits each of
 // the way from the least to the greatest, side by side. One row and one column come before it, for
 // places between the last and the first, or before the first.
-inline std::vector<uint64_t> quads_of(const float* from, int h, int w, bool wrap, float low, float high) {
-    std::vector<uint64_t> found(size_t(h + 1) * (w + 1));
-    const float scale = high > low ? kQuadMost / (high - low) : 0.f;
-    const auto at = [&](int y, int x) {
-        y = wrap ? (y + h) % h : std::clamp(y, 0, h - 1);
-        x = wrap ? (x + w) % w : std::clamp(x, 0, w - 1);
-        const float share = (from[size_t(y) * w + x] - low) * scale;
-        // What is no number counts as the least.
-        return uint64_t(share > 0.f ? std::min(share, kQuadMost) + 0.5f : 0.f);
-    };
-    for (int y = -1; y < h; ++y)
-        for (int x = -1; x < w; ++x)
-            found[size_t(y + 1) * (w + 1) + x + 1] =
-                at(y, x) | at(y, x + 1) << 16 | at(y + 1, x) << 32 | at(y + 1, x + 1) << 48;
-    return found;
-}
+struct Quads {
+    std::vector<uint64_t> at;
+    float low = 0, step = 0;
+
+    Quads() = default;
+    Quads(const float* from, int h, int w, bool wrap) : at(size_t(h + 1) * (w + 1)) {
+        const auto [least, most] = std::minmax_element(from, from + size_t(h) * w);
+        low = *least;
+        step = (*most - low) / 65535.f;
+        const auto share = [&](int y, int x) {
+            y = wrap ? (y + h) % h : std::clamp(y, 0, h - 1);
+            x = wrap ? (x + w) % w : std::clamp(x, 0, w - 1);
+            const float s = step > 0.f ? (from[size_t(y) * w + x] - low) / step + 0.5f : 0.f;
+            return uint64_t(s > 0.f ? std::min(s, 65535.f) : 0.f);  // what is no number: the least
+        };
+        for (int y = -1; y < h; ++y)
+            for (int x = -1; x < w; ++x)
+                at[size_t(y + 1) * (w + 1) + x + 1] = share(y, x) | share(y, x + 1) << 16 |
+                                                      share(y + 1, x) << 32 |
+                                                      share(y + 1, x + 1) << 48;
+    }
+};
 
 struct Batch {
     int64_t size = 0;
@@ -181,7 +187,7 @@ struct Batch {
     const float *drift = nullptr;      // four a query, of rays that curvature bends; null is 0
     const float *target = nullptr, *weight = nullptr;
     float top = 0, bottom = 0;  // of the heights
-    const uint64_t *quads = nullptr, *cover_quads = nullptr;  // of frozen curved heights, or null
+    const Quads *quads = nullptr, *cover_quads = nullptr;  // of frozen curved heights, or null
 };
 
 struct Gradient {

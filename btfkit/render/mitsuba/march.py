@@ -24,6 +24,8 @@ Numbers = list[Any]
 Lookup = Callable[[Any, Any, Any], Any]
 # As in native.neural.bent.
 _LEAST_SINE, _LEAST_BEND, _LEAST_DEPTH = 1e-6, 1e-9, 1e-6
+# Above every height.
+_FAR = 1e30
 
 
 class Met(NamedTuple):
@@ -55,7 +57,7 @@ def on_plane(
     start = mi.Float(top) + 0 * uv[0]
     met = _march(
         lambda k: start + (bottom - top) * dr.minimum(k / count, 1), above, start, count,
-        active=active, most=LOOKS, limited=False,
+        active=active, most=LOOKS,
     )[0]  # fmt: skip
     return met * dr.maximum(view[2], LOWEST_COSINE) / low * scale
 
@@ -109,7 +111,7 @@ def on_curved(
     count = dr.clip(dr.ceil(texels), 1, dr.select(sure, mi.Float(LOOKS), found.looks))
     way, under = _march(
         lambda k: start + reach * dr.minimum(k / count, 1), above, start, count,
-        active=active, most=max(found.looks, LOOKS), limited=True,
+        active=active, most=max(found.looks, LOOKS), again=~sure,
     )  # fmt: skip
     opaque = sure | (under <= 0)
     way = dr.select(opaque, way, stop)
@@ -134,20 +136,44 @@ def _march(
     *,
     active: Any,
     most: int,
-    limited: bool,
+    again: Any = None,
 ) -> tuple[Any, Any]:
-    """Where a ray first is under the surface, and how high it is at the last look."""
-    low = high = start
+    """Where a ray first is under the surface, and how high it is at the last look.
+
+    Args:
+        again: rays that may pass, which then end after `count` looks: three more are taken around
+            the one that is the least above the surface. None where all are stopped.
+    """
+    low = high = near = start
     under = gap = above(start, active)
-    going = mi.Bool(active)
+    least, going = mi.Float(_FAR), mi.Bool(active)
     for k in range(1, most + 1):
         high, gap = dr.select(going, low, high), dr.select(going, under, gap)
         to = place(mi.Float(k))
         rest = above(to, going)
         low, under = dr.select(going, to, low), dr.select(going, rest, under)
         going &= rest > 0
-        if limited:
-            going &= k < count
+        if again is None:
+            continue
+        going &= k < count
+        nearer = going & (rest < least)
+        near, least = dr.select(nearer, to, near), dr.select(nearer, rest, least)
+    if again is not None:
+        passes = active & again & (under > 0) & (least < _FAR)
+        half = (place(mi.Float(1)) - start) / 2
+        before, after = above(near - half, passes), above(near + half, passes)
+        ahead = after < before
+        side = near + dr.select(ahead, half, -half) / 2
+        beside = above(side, passes)
+        # The last counts: what is nearest to the viewer.
+        for at, found, since, was in (
+            (near + half, after, near, least),
+            (side, beside, dr.select(ahead, near, near - half), dr.select(ahead, least, before)),
+            (near - half, before, near - 2 * half, least),
+        ):
+            hit = passes & (found <= 0)
+            low, under = dr.select(hit, at, low), dr.select(hit, found, under)
+            high, gap = dr.select(hit, since, high), dr.select(hit, was, gap)
     first = _met(high, low, gap, under)
     rest = above(first, active)
     short = rest > 0
