@@ -137,17 +137,18 @@ def _march(
     limited: bool,
 ) -> tuple[Any, Any]:
     """Where a ray first is under the surface, and how high it is at the last look."""
-    low = high = start
-    under = gap = above(start, active)
-    going = mi.Bool(active)
-    for k in range(1, most + 1):
-        high, gap = dr.select(going, low, high), dr.select(going, under, gap)
-        to = place(mi.Float(k))
+
+    def look(k: Any, low: Any, high: Any, under: Any, gap: Any, going: Any) -> Any:
+        to = place(k)
         rest = above(to, going)
-        low, under = dr.select(going, to, low), dr.select(going, rest, under)
-        going &= rest > 0
-        if limited:
-            going &= k < count
+        going = (rest > 0) & (k < (count if limited else most))
+        return k + 1, to, low, rest, under, going
+
+    gap = above(start, active)
+    _, low, high, under, gap, _ = dr.while_loop(
+        (mi.Float(1), start, start, gap, gap, mi.Bool(active)), lambda *state: state[-1], look,
+        max_iterations=most,
+    )  # fmt: skip
     first = _met(high, low, gap, under)
     rest = above(first, active)
     short = rest > 0
