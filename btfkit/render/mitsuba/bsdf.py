@@ -67,7 +67,7 @@ def _classes() -> tuple[Any, Any]:
             return self._does.pdf(ctx, si, wo, active)
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+            return self._does.eval_pdf(ctx, si, wo, active)
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
             return self._does.sample(ctx, si, sample1, sample2, active)

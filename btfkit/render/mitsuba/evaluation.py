@@ -16,6 +16,7 @@ from btfkit.conventions import (
 )
 from btfkit.native.neural.plain import YUV_TO_RGB
 from btfkit.program import (
+    Dense,
     DepthNetwork,
     Heights,
     OffsetNetwork,
@@ -40,7 +41,7 @@ class Seen(NamedTuple):
         uv, view: as asked. met: where the view ray ends. level: of detail.
         turned: the view in the frame where the ray ends.
         offset: how far a network moves lookups, u and v. values: numbers of the textures that no
-            light moves, by name.
+            light moves, by name. begun: sums of the first layer over what no light changes.
     """
 
     uv: Numbers
@@ -51,6 +52,7 @@ class Seen(NamedTuple):
     curvature: Any
     turned: Numbers
     values: dict[str, Numbers]
+    begun: Numbers
 
 
 @final
@@ -86,6 +88,7 @@ class Evaluation:
             if found.opacity is not None:
                 self._holes = Surface(found.opacity, program.wrap)
         self._own = [Pyramid(part.texture.levels[:1], program.wrap) for part in program.networks]
+        self._early, self._late, self._layers = _parted(program)
 
     @property
     def passes(self) -> bool:
@@ -127,11 +130,18 @@ class Evaluation:
         if self._program.curved:
             turn = turned(view, view, met.turn)
             turn[2] = dr.select(met.turn == 0, turn[2], dr.maximum(turn[2], LOWEST_SEEN))
-        found = Seen(uv, view, met, offset, level, bent, turn, {})
+        found = Seen(uv, view, met, offset, level, bent, turn, {}, [])
         for texture in self._textures:
             if not texture.light:
                 found.values[texture.name] = self._looked_up(texture, found, None, active)
-        return found
+        if not self._early:
+            return found
+        known = layers.known(turn, turn, level, bent)
+        for texture in program.textures:
+            if not texture.light:
+                known |= dict(zip(texture.features, found.values[texture.name], strict=True))
+        early, first = self._early
+        return found._replace(begun=layers.sums(first, [known[name] for name in early]))
 
     def answer(self, seen: Seen, light: Numbers, active: Any) -> tuple[Numbers, Any]:
         """Reflectance by channel under a light, and opacity."""
@@ -150,7 +160,7 @@ class Evaluation:
             axis = values[program.textures[0].name][3 * k : 3 * k + 3]
             for direction in (half, toward):
                 known[next(names)] = sum(a * b for a, b in zip(axis, direction, strict=True))
-        raw = self._run(known)
+        raw = self._run(known, seen.begun, active)
         white = values[program.scaling.name] if program.scaling else None
         rgb, opacity = self._output(raw, toward, white)
         if program.opacity == "march":
@@ -178,21 +188,26 @@ class Evaluation:
             ]
         return seen.met.opacity
 
-    def _run(self, known: dict[str, Any]) -> Numbers:
-        """The layers; numbers of the view are summed first, so that lights share the sums."""
-        program = self._program
-        names = program.inputs
-        if not program.layers:
-            return [known[name] for name in names]
-        lit = {"lx", "ly", "lz", "hx", "hy", "hz", "cos_diff", "lx_disc", "ly_disc"}
-        lit |= {name for t in program.textures if t.light for name in t.features}
-        late = [name in lit or name.startswith("frame.") for name in names]
-        order = sorted(range(len(names)), key=lambda k: late[k])
-        first, *rest = program.layers
-        if not first.residual:
-            first = replace(first, weight=first.weight[:, order])
-            names = tuple(names[k] for k in order)
-        return layers.run([first, *rest], [known[n] for n in names], rounded=program.rounded)
+    def _run(self, known: dict[str, Any], begun: Numbers, active: Any) -> Numbers:
+        """The layers, as a function of the kernel: an evaluation and a sample both call it.
+
+        Unrolled twice they leave the processor's cache of instructions, and take twice as long.
+        """
+        x = [known[name] for name in self._late]
+        if not self._layers:
+            return x
+        rounded, count = self._program.rounded, len(self._layers[-1].bias)
+
+        def asked(begun: Numbers, x: Numbers) -> Numbers:
+            return layers.run(self._layers, x, rounded=rounded, begun=begun or None)
+
+        def idle(begun: Numbers, x: Numbers) -> Numbers:
+            return [mi.Float(0)] * count
+
+        # Two of them: a single one would be unrolled where it is called.
+        which = dr.select(active, mi.UInt32(0), 1)
+        found: Numbers = dr.switch(which, [asked, idle], begun, x)
+        return found
 
     def _met(
         self, uv: Numbers, view: Numbers, level: Any, bent: Any, active: Any
@@ -274,3 +289,18 @@ class Evaluation:
         if masks:
             logs = [y * mask for y, mask in zip(logs, masks, strict=True)]
         return [layers.expm1(dr.clip(y, 0, MOST_LOG)) for y in logs], opacity
+
+
+def _parted(program: Program) -> tuple[Any, tuple[str, ...], tuple[Dense, ...]]:
+    """Inputs that no light changes with their part of the first layer, the others, the layers."""
+    names = program.inputs
+    if not program.layers or program.layers[0].residual:
+        return None, names, program.layers
+    lit = {"lx", "ly", "lz", "hx", "hy", "hz", "cos_diff", "lx_disc", "ly_disc"}
+    lit |= {name for t in program.textures if t.light for name in t.features}
+    late = [name in lit or name.startswith("frame.") for name in names]
+    first, *rest = program.layers
+    early, after = ([k for k, each in enumerate(late) if each == which] for which in (False, True))
+    part = (tuple(names[k] for k in early), replace(first, weight=first.weight[:, early]))
+    others = tuple(names[k] for k in after)
+    return part, others, (replace(first, weight=first.weight[:, after]), *rest)

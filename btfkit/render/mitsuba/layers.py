@@ -13,8 +13,8 @@ from btfkit.conventions import CURVATURE_UNIT, EPSILON, LEAK, LEVELS_UNIT
 from btfkit.program import Dense
 
 Numbers = list[Any]
-# Sums that are taken at once.
-_TOGETHER = 8
+# Parts of a sum that are taken at once: in one chain each product would wait for the one before.
+_PARTS = 3
 
 
 def known(light: Numbers, view: Numbers, level: Any, curvature: Any) -> dict[str, Any]:
@@ -36,28 +36,42 @@ def known(light: Numbers, view: Numbers, level: Any, curvature: Any) -> dict[str
     return found
 
 
-def run(layers: Sequence[Dense], x: Numbers, *, rounded: bool) -> Numbers:
+def run(
+    layers: Sequence[Dense], x: Numbers, *, rounded: bool, begun: Numbers | None = None
+) -> Numbers:
     """What layers make of numbers.
 
     Args:
         rounded: whether what goes from one to the next is rounded to bfloat16.
+        begun: stands for the biases of the first layer.
     """
     for k, layer in enumerate(layers):
-        weights = layer.weight.tolist()
-        sums = [mi.Float(bias) for bias in layer.bias.tolist()]
-        # A few sums at a time: as many chains as the units take, and they stay in registers.
-        for first in range(0, len(sums), _TOGETHER):
-            rows = range(first, min(first + _TOGETHER, len(sums)))
-            for column, value in enumerate(x):
-                for row in rows:
-                    sums[row] = dr.fma(weights[row][column], value, sums[row])
+        z = sums(layer, x, begun if k == 0 else None)
         if layer.gain is not None and layer.centre is not None:
-            sums = _normalised(sums, layer.gain.tolist(), layer.centre.tolist())
-        y = [_activated(layer, layer.omega * z if layer.omega != 1 else z) for z in sums]
+            z = _normalised(z, layer.gain.tolist(), layer.centre.tolist())
+        y = [_activated(layer, layer.omega * each if layer.omega != 1 else each) for each in z]
         if rounded and k + 1 < len(layers):
             y = [_bfloat16(value) for value in y]
         x = [a + b for a, b in zip(x, y, strict=True)] if layer.residual else y
     return x
+
+
+def sums(layer: Dense, x: Numbers, begun: Numbers | None = None) -> Numbers:
+    """Biases, or what is `begun`, and the weighted sums of a layer."""
+    starts = begun or [mi.Float(bias) for bias in layer.bias.tolist()]
+    ends = sorted({len(x) * k // _PARTS for k in range(1, _PARTS + 1)})
+    found = []
+    for start, row in zip(starts, layer.weight.tolist(), strict=True):
+        total, first = start, 0
+        for end in ends:
+            part = None
+            for weight, value in zip(row[first:end], x[first:end], strict=True):
+                part = weight * value if part is None else dr.fma(weight, value, part)
+            if part is not None:
+                total = total + part
+            first = end
+        found.append(total)
+    return found
 
 
 def _normalised(sums: Numbers, gain: list[float], centre: list[float]) -> Numbers:
@@ -68,10 +82,12 @@ def _normalised(sums: Numbers, gain: list[float], centre: list[float]) -> Number
 
 
 def _activated(layer: Dense, z: Any) -> Any:
+    # Not dr.maximum, which takes six instructions to let NaN of either side pass.
     if layer.activation == "relu":
-        return dr.maximum(z, 0)
+        return dr.select(z < 0, 0, z)
     if layer.activation == "leaky":
-        return dr.maximum(z, LEAK * z)
+        low = LEAK * z
+        return dr.select(low > z, low, z)
     return dr.sin(z) if layer.activation == "sine" else z
 
 

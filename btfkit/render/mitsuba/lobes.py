@@ -11,6 +11,7 @@ import numpy as np
 
 from btfkit.conventions import LEAST_FACING
 from btfkit.materials.lobes import LobeTable
+from btfkit.render.mitsuba.pyramid import kept
 
 
 class Drawn(NamedTuple):
@@ -38,8 +39,7 @@ class Lobes:
         sizes = [level.shape[:2] for level in table.levels]
         starts = np.cumsum([0, *(h * w for h, w in sizes)])[:-1]
         flat = np.concatenate([level.reshape(-1, 5) for level in table.levels])
-        self._cells = mi.Float(np.ascontiguousarray(flat[:, :4], np.float32).reshape(-1))
-        self._grazing = mi.Float(np.ascontiguousarray(flat[:, 4], np.float32))
+        self._cells, self._grazing = kept(flat[:, :4]), kept(flat[:, 4])
         shapes = np.array([(w, h, start) for (h, w), start in zip(sizes, starts, strict=True)])
         self._sizes = [mi.UInt32(part.astype(np.uint32)) for part in shapes.T]
         cells = sizes[0]

@@ -144,20 +144,23 @@ def _march(
         again: rays that may pass, which then end after `count` looks: three more are taken around
             the one that is the least above the surface. None where all are stopped.
     """
-    low = high = near = start
-    under = gap = above(start, active)
-    least, going = mi.Float(_FAR), mi.Bool(active)
-    for k in range(1, most + 1):
-        high, gap = dr.select(going, low, high), dr.select(going, under, gap)
-        to = place(mi.Float(k))
+    limit = mi.Float(most) if again is None else count
+
+    def look(
+        k: Any, low: Any, high: Any, under: Any, gap: Any, near: Any, least: Any, going: Any
+    ) -> Any:
+        to = place(k)
         rest = above(to, going)
-        low, under = dr.select(going, to, low), dr.select(going, rest, under)
-        going &= rest > 0
-        if again is None:
-            continue
-        going &= k < count
+        going = (rest > 0) & (k < limit)
         nearer = going & (rest < least)
         near, least = dr.select(nearer, to, near), dr.select(nearer, rest, least)
+        return k + 1, to, low, rest, under, near, least, going
+
+    gap = above(start, active)
+    _, low, high, under, gap, near, least, _ = dr.while_loop(
+        (mi.Float(1), start, start, gap, gap, start, mi.Float(_FAR), mi.Bool(active)),
+        lambda *state: state[-1], look, max_iterations=most,
+    )  # fmt: skip
     if again is not None:
         passes = active & again & (under > 0) & (least < _FAR)
         half = (place(mi.Float(1)) - start) / 2

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from btfkit.materials.base import Material
 from btfkit.materials.measured.interpolation import GRAZING, Interpolation
 from btfkit.materials.measured.triangulation import DirectionMesh
-from btfkit.render.mitsuba.pyramid import beside
+from btfkit.render.mitsuba.pyramid import beside, kept
 from btfkit.render.picture import to_rgb
 
 Numbers = list[Any]
@@ -75,7 +75,7 @@ class Measured:
             good: NDArray[np.bool_] = np.all(np.isfinite(values), axis=2)
             texels[k, ..., : self._count] = np.where(good[..., None], values, 0) @ to
             texels[k, ..., 3] = good
-        self._texels = mi.Float(texels.reshape(-1))
+        self._texels = kept(texels)
         self._size, self._pairs = (w, h), mi.UInt32(self._nest.pairs.reshape(-1))
         self._inner = len(self._nest.pairs[0])
         self._outer_mesh, self._inner_mesh = (
@@ -135,8 +135,8 @@ class _Triangles:
         self._half = tables.half
         self._reaching = mi.UInt32(tables.reaching.astype(np.uint32).reshape(-1))
         self._rows = mi.UInt32(tables.rows.astype(np.uint32).reshape(-1))
-        self._frame = mi.Float(tables.frame.astype(np.float32).reshape(-1))
-        self._origin = mi.Float(tables.origin.astype(np.float32).reshape(-1))
+        self._frame = kept(tables.frame)
+        self._origin = kept(tables.origin)
 
     def __call__(self, way: Numbers, active: Any) -> tuple[Numbers, Numbers]:
         x, y = way[0] / (1 + way[2]), way[1] / (1 + way[2])

@@ -41,6 +41,9 @@ class Pointwise:
         found = float(self._material.pdf(light=[wo.x, wo.y, wo.z], **self._query(si)))
         return found * self._cover(si) if self._shares(ctx) else found
 
+    def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
     def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
         found = dr.zeros(mi.BSDFSample3f)
         found.eta = 1.0

@@ -14,6 +14,17 @@ Numbers = list[Any]
 _GROUP = 4
 
 
+def kept(values: Any) -> Any:
+    """Numbers as a buffer of Dr.Jit's own.
+
+    Memory of numpy's mostly does not start where 16 numbers may be read at once, and Dr.Jit then
+    fetches the four of a texel one by one.
+    """
+    found = mi.Float(np.ascontiguousarray(values, np.float32).reshape(-1)) + dr.opaque(mi.Float, 0)
+    dr.eval(found)
+    return found
+
+
 @final
 class Pyramid:
     """Levels of a texture in one buffer, bilinear between texel centres and between levels.
@@ -32,7 +43,7 @@ class Pyramid:
         starts = np.cumsum([0, *(int(h) * int(w) for h, w in sizes)])[:-1].astype(np.uint32)
         spare = self._groups * _GROUP - self._channels
         flat = [np.pad(np.asarray(x, np.float32), ((0, 0), (0, 0), (0, spare))) for x in levels]
-        self.texels = mi.Float(np.concatenate([level.reshape(-1) for level in flat]))
+        self.texels = kept(np.concatenate([level.reshape(-1) for level in flat]))
         self._one = (int(sizes[0, 1]), int(sizes[0, 0]), 0)
         self._tables = [mi.UInt32(part.copy()) for part in (sizes[:, 1], sizes[:, 0], starts)]
 
@@ -82,7 +93,7 @@ class Surface:
         # The cell at column x, row y lies between texels x - 1, x and y - 1, y.
         p = np.pad(np.asarray(heights, np.float32), 1, mode="wrap" if wrap else "edge")
         corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, :-1], p[1:, 1:]], axis=-1)
-        self._corners = mi.Float(np.ascontiguousarray(corners).reshape(-1))
+        self._corners = kept(corners)
 
     def __call__(self, u: Any, v: Any, active: Any) -> Any:
         """The height there."""
