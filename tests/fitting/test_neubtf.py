@@ -443,6 +443,12 @@ def test_copies_count_by_what_they_would_have_bettered_and_fade_where_nothing_is
     # 576 texels and a pull of 10 of them
     np.testing.assert_allclose(mix.share, [0, 1, 0.5], atol=0.06)
     assert mix.near == 2
+    last = copied[[1, 0, 2, 3]]
+    heights = copying.Mix.measured(
+        answer[[1, 0, 2]], last, wanted[[1, 0, 2]], everywhere, mix.scale
+    )
+    # Encoders answer smooth heights: of noisy ones less than half is copied.
+    np.testing.assert_allclose(heights.share[:2], [copying._MOST_OF_HEIGHTS, 0], atol=0.06)
     found, share = mix(answer, copied)
     assert share == pytest.approx(0.5, abs=0.03)
     assert (found[1] - wanted[1]).abs().mean() < 0.02

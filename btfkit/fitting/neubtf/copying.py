@@ -29,6 +29,9 @@ REACH = 16
 _COMPONENTS, _MOST_PLACES, _VOTERS = 24, 1 << 15, 16
 # Texels of a patch that are looked at for its components, and rows compared at once.
 _LOOKED_AT, _ROWS = 1 << 13, 512
+# Of heights, the first channel, more is not copied: they are as noisy as what was fitted, where the
+# encoder's are smooth, and half of the noise costs nothing in answers.
+_MOST_OF_HEIGHTS = 0.4
 # Pull of the measured mix towards the encoder's answer, texels times variance; quantile of the
 # distances within which copies count in full.
 _PULL, _NEAR = 10.0, 0.95
@@ -56,6 +59,7 @@ class Mix:
         """What would have been best over some texels.
 
         Only between the two: their amplitude is not fitted, for a few texels do not tell it.
+        Heights are the first channel.
 
         Args:
             answer, wanted: (k, h, w). copied: (k + 1, h, w), the distance last.
@@ -64,8 +68,9 @@ class Mix:
         apart = (copied[:-1] - answer)[:, inside].double()
         missed = (wanted - answer)[:, inside].double()
         share = (apart * missed).sum(1) / (apart.square().sum(1) + _PULL)
-        near = float(copied[-1][inside].quantile(_NEAR))
-        return Mix(share.clamp(0, 1).float(), near, scale)
+        share = share.clamp(0, 1).float()
+        share[0] = share[0].clamp_max(_MOST_OF_HEIGHTS)
+        return Mix(share, float(copied[-1][inside].quantile(_NEAR)), scale)
 
     @staticmethod
     def none(scale: Tensor) -> Mix:
