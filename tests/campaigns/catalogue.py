@@ -38,12 +38,12 @@ class Campaign:
 
 
 CAMPAIGNS = {
-    "readers": Campaign("campaigns.inputs:readers", sample=6000, share=4),
-    "pictures": Campaign("campaigns.inputs:pictures", sample=30000, share=2),
+    "readers": Campaign("campaigns.inputs:readers", sample=16000, share=4),
+    "pictures": Campaign("campaigns.inputs:pictures", sample=50000, share=2),
     "tables": Campaign("campaigns.inputs:tables", sample=12000, share=2),
-    "malice": Campaign("campaigns.malice:malice", sample=300, share=2, limit_s=20),
+    "malice": Campaign("campaigns.malice:malice", sample=600, share=2, limit_s=20),
     "queries": Campaign(
-        "campaigns.queries:queries", sample=1000, share=4, limit_s=30, limit_bytes=None
+        "campaigns.queries:queries", sample=3000, share=4, limit_s=30, limit_bytes=None
     ),
     "kills": Campaign("campaigns.kills:kills", sample=45, share=4, limit_s=300, limit_bytes=None),
     "disks": Campaign(

@@ -6,6 +6,8 @@ and not of Python's start; time is the child's own on the processor, which other
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import os
 import shutil
 import signal
@@ -79,6 +81,23 @@ def in_child(job: Callable[[], int], after_s: float | None, log: Path) -> tuple[
                 raise Find(f"over {_HANGS_S:g} s of CPU: {log.read_text()[-400:]}")
             return KILLED, spent
         time.sleep(0.0005)
+
+
+def loaded(job: Callable[[], int], log: Path) -> None:
+    """Import what a job imports, so that its children need not, and see no file that changes."""
+    names = log.with_name("modules")
+
+    def listed() -> int:
+        code = job()
+        names.write_text("\n".join(sys.modules))
+        return code
+
+    code, _spent = in_child(listed, None, log)
+    if code:
+        raise RuntimeError(f"a job alone ends with {code}: {log.read_text()[-500:]}")
+    for name in names.read_text().splitlines():
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
 
 
 def small_steps() -> None:

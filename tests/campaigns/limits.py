@@ -10,6 +10,7 @@ import resource
 import shutil
 import signal
 import struct
+import subprocess
 import sys
 import tempfile
 import time
@@ -199,4 +200,8 @@ def _folder() -> Iterator[Path]:
     try:
         yield folder
     finally:
+        # A worker that was killed leaves its disk.
+        for line in Path("/proc/mounts").read_text().splitlines():
+            if line.split()[1].startswith(f"{folder}/"):
+                subprocess.run(["umount", "-l", line.split()[1]], check=False)
         shutil.rmtree(folder, ignore_errors=True)

@@ -102,7 +102,7 @@ def test_a_running_number_that_angles_contradict_is_counted_and_angles_count(
         ("lp", "dirs.lp", "0.1 -0.2 1.0", "1_0 -0.2 1.0", "line 3 .* expected: file x y z"),
         ("diligent", "filenames.txt", "002", "001", "names an image twice; remove one"),
         ("diligent", "filenames.txt", "002", "012", "names '012.png', which is not there"),
-        ("diligent", "light_intensities.txt", "2 3 4", "2 0 4", "holds one that is not above 0"),
+        ("diligent", "light_intensities.txt", "2 3 4", "2 0 4", "holds one that is not 1e-15 to"),
         ("diligent", "light_intensities.txt", "2 3 4", "2 3 1_4", "line 2 .* expected 3 numbers"),
         ("diligent", "light_directions.txt", "0.1 -0.2 1.0\n", "", "3 lines for 4 images"),
         ("diligent", "light_directions.txt", "0.1 -0.2 1.0", "0 0 0", r"light\[1\] .* not a direction"),
