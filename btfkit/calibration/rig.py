@@ -26,6 +26,8 @@ Floats = NDArray[np.floating]
 # Camera pixels that a texel gets by default, seen as squarely as it is: of a mosaic, whose colours
 # lie apart, more.
 _PIXELS_A_TEXEL = {False: 2.0, True: 3.0}
+# More than any camera has pixels.
+_MOST_TEXELS = 1 << 28
 # Half of a usual sample: what an axis that is off moves its rim by.
 _REACH_MM = 20.0
 
@@ -139,6 +141,11 @@ def grid_of(
         wanted = _PIXELS_A_TEXEL[rig.mosaic] / pixels
         texel_mm = float(size[0]) / max(round(size[0] / wanted), 1)
     rows, columns = (max(round(float(side) / texel_mm), 1) for side in (size[1], size[0]))
+    if rows * columns > _MOST_TEXELS:
+        raise CalibrationError(
+            f"target.sample.size_mm {size!r} takes {rows} x {columns} texels of {texel_mm:.3g} mm",
+            remedy="correct it in sequence.json, or give larger texels (--texel-mm)",
+        )
     return Grid(rows, columns, texel_mm)
 
 

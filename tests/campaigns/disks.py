@@ -14,9 +14,11 @@ from campaigns.limits import Attempt, Find
 
 _PAGE = 4096
 _ROOM = f"size={64 << 20},nr_inodes=10000"
-# One more each time, to beyond what a job needs: pages of its files, and files.
-_STEPS = {"ingest": (1, 160), "fit": (3, 360), "capture": (1, 100)}
+# To beyond what a job needs: steps of so many pages of its files, and files.
+_STEPS = {"ingest": (1, 160), "fit": (3, 120), "capture": (1, 100)}
 _FILES = {"ingest": 160, "fit": 16, "capture": 60}
+# Sizes come in an order in which any few are spread over all; it has no factor of their numbers.
+_SPREAD = 61
 
 
 def disks(folder: Path) -> Attempt:
@@ -69,10 +71,10 @@ def _shrink(disk: Path, each: jobs.Job, name: str, seed: int) -> None:
     number, kind = seed // 6, seed // 3 % 2
     if kind:
         # The folder itself is one.
-        _mount(disk, f"remount,nr_inodes={2 + number % _FILES[name]}")
+        _mount(disk, f"remount,nr_inodes={2 + _SPREAD * number % _FILES[name]}")
         return
     step, most = _STEPS[name]
-    pages = 1 + step * number % most
+    pages = 1 + step * (_SPREAD * number % most)
     if isinstance(each, jobs.Capture):
         # It asks for room before it begins.
         each.begun = lambda: _fill(disk, pages)

@@ -227,6 +227,13 @@ def _no_run(folder: Path) -> None:
     path.write_text(json.dumps(told))
 
 
+def _endless(folder: Path) -> None:
+    path = folder / "sequence.json"
+    told = json.loads(path.read_text())
+    told["target"]["sample"]["size_mm"] = [7, 10**12]
+    path.write_text(json.dumps(told))
+
+
 def _far(folder: Path) -> None:
     path = folder / "sequence.json"
     told = json.loads(path.read_text())
@@ -257,6 +264,7 @@ def _frame(folder: Path) -> None:
         ("sequence", _frame, "cut short"),
         ("sequence", _rotation, "expected three perpendicular unit vectors"),
         ("sequence", _no_rotation, "expected three perpendicular unit vectors"),
+        ("sequence", _endless, r"size_mm \[7, 1000000000000\] takes \d+ x \d+ texels"),
         ("sequence", _far, r"the camera of pair . lies at \[.*e\+30"),
         ("sequence", _away, "no frame's camera sees the middle of the sample"),
         ("sequence", _name, r"first: frames/003\.\\x00g\)"),
