@@ -37,7 +37,8 @@ def disks(folder: Path) -> Attempt:
     def attempt(seed: int) -> Counter[str]:
         name = list(made)[seed % 3]
         each = made[name]
-        with mounted(disk):
+        # What was trained is kept in the working folder where its disk is full.
+        with mounted(disk), contextlib.chdir(folder):
             _shrink(disk, each, name, seed)
             code, _spent = jobs.in_child(each.job, None, log)
             there = each.held() if each.out.exists() and name != "capture" else wanted[name]
