@@ -140,7 +140,7 @@ class _Subset(Textures):
 def narrowed(values: NDArray[np.floating]) -> NDArray[np.float16] | NDArray[np.float32]:
     """Values as float16, or as float32 where one of them is beyond `HALF_RANGE`."""
     largest = np.abs(values).max(initial=0.0, where=np.isfinite(values))
-    return values.astype(np.float16 if largest <= HALF_RANGE else np.float32)
+    return values.astype(np.float16) if largest <= HALF_RANGE else values.astype(np.float32)
 
 
 def as_textures(source: Any) -> Textures:

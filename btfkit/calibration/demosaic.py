@@ -132,7 +132,7 @@ def kernels() -> dict[str, NDArray[np.float64]]:
     "cross" gives green at red or blue, "row" and "column" red or blue at a green pixel in whose
     row or column they lie, "diagonal" red at blue. Own weights sum to 1, the others to 0.
     """
-    offset = np.stack(np.indices((_SIDE, _SIDE)).reshape(2, -1) - _REACH, axis=-1)
+    offset = np.moveaxis(np.indices((_SIDE, _SIDE)), 0, -1).reshape(-1, 2) - _REACH
     alike = _correlation()
     between = alike[tuple(np.moveaxis(offset[:, None] - offset, -1, 0))]
     out = {}
