@@ -24,10 +24,11 @@ from btfkit.errors import FitError, FormatError
 from btfkit.files import refuse_existing
 from btfkit.fitting.neubtf import augment
 from btfkit.fitting.neubtf.beside import put_together, read_beside
-from btfkit.fitting.neubtf.carrier import CARRIERS, Asked, errors_in
+from btfkit.fitting.neubtf.carrier import Asked, errors_in
+from btfkit.fitting.neubtf.carriers import CARRIERS
 from btfkit.fitting.neubtf.data import frontal_slice
-from btfkit.fitting.neubtf.guides import Window
 from btfkit.fitting.neubtf.pictures import opaque, prepare, read_guidance
+from btfkit.fitting.neubtf.windows import Window
 from btfkit.materials import file
 from btfkit.materials.base import Header, Material
 from btfkit.materials.neubtf.composite import Composite

@@ -17,7 +17,7 @@ from btfkit import propagation
 from btfkit.btf import BTF
 from btfkit.errors import FitError, FormatError
 from btfkit.fitting import fit, loop, training
-from btfkit.fitting.neubtf import augment, carrier, copying, muon
+from btfkit.fitting.neubtf import augment, carrier, copying, muon, windows
 from btfkit.fitting.neubtf import encoder as encoders
 from btfkit.fitting.neubtf import paper as published
 from btfkit.fitting.neubtf import trainable as neubtf
@@ -170,9 +170,9 @@ def test_of_a_large_sample_a_part_tells_how_well_is_carried(
     tiny: BTF, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = begun(tiny)
-    assert model._judged(neubtf.Window(8, 8, 16, 16)) == ((0, 0, 32, 32), (8, 8, 16, 16))
+    assert model._judged(windows.Window(8, 8, 16, 16)) == ((0, 0, 32, 32), (8, 8, 16, 16))
     monkeypatch.setattr(neubtf, "_MOST_SIDE", 12)
-    part, window = model._judged(neubtf.Window(8, 8, 16, 16))
+    part, window = model._judged(windows.Window(8, 8, 16, 16))
     # Beside the kept corner three quarters that the encoder has seen, to be copied from.
     assert (part, window) == ((2, 2, 12, 12), (8, 8, 6, 6))
     for progress in (0.0, 0.27, 0.95):
@@ -187,18 +187,18 @@ def test_a_part_of_a_material_answers_as_the_whole_does_there(tiny: BTF) -> None
     for index in range(30):
         model.step(0.2 * index / 30)
     material = model.free.material()
-    part = carrier.part_of(material, neubtf.Window(4, 6, 24, 20))
+    part = windows.part_of(material, windows.Window(4, 6, 24, 20))
     light, view = [0.3, 0.2, 0.9], [0.0, 0.0, 1.0]
     all_of_it = material.evaluate(texel_centres(32, 32), light, view).reflectance
     some = part.evaluate(texel_centres(24, 20), light, view).reflectance
     # float16 heights of another scale move the places by 2^-11 of them; the border is another one.
     np.testing.assert_allclose(some[2:-2, 2:-2], all_of_it[6:26, 8:24], atol=2e-3)
-    assert carrier.part_of(material, neubtf.Window(0, 0, 32, 32)) is material
+    assert windows.part_of(material, windows.Window(0, 0, 32, 32)) is material
 
 
 def whole(guides: Any) -> Any:
     """The same guides, unmoved."""
-    guides._window = lambda: neubtf.Window(0, 0, 32, 32)
+    guides._window = lambda: windows.Window(0, 0, 32, 32)
     return guides
 
 
@@ -418,7 +418,7 @@ def test_copied_in_parts_is_copied_whole(wrap: bool, monkeypatch: pytest.MonkeyP
 
 def test_nothing_is_copied_from_what_is_left_out_nor_over_a_border() -> None:
     answer, channels = smooth(2, 40, 40), torch.rand(2, 40, 40, generator=generator())
-    kept = carrier.inside(neubtf.Window(10, 10, 20, 20), (40, 40))
+    kept = windows.inside(windows.Window(10, 10, 20, 20), (40, 40))
     channels[:, kept] = torch.nan
     copier = copying.Copier.of(answer, channels, wrap=True, left_out=kept)
     assert copier is not None

@@ -247,7 +247,8 @@ def test_the_verb_takes_normals_and_a_mask(
 
 
 def test_a_published_model_knows_no_normals() -> None:
-    from btfkit.fitting.neubtf.carrier import Asked, PaperCarrier
+    from btfkit.fitting.neubtf.carrier import Asked
+    from btfkit.fitting.neubtf.carriers import PaperCarrier
 
     carrier = PaperCarrier(None, None, None)  # type: ignore[arg-type]
     with pytest.raises(FitError, match="has no heights that normals could tell"):

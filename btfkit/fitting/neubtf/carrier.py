@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -13,15 +13,14 @@ from torch import Tensor
 
 from btfkit import metrics
 from btfkit.btf import BTF
-from btfkit.errors import FitError
-from btfkit.fitting.neubtf import augment, unet
+from btfkit.fitting.neubtf import augment
 from btfkit.fitting.neubtf.copying import REACH, Copier, Mix
 from btfkit.fitting.neubtf.encoder import STRIDE, Encoder, encode_in_tiles, in_parts
-from btfkit.fitting.neubtf.guides import Window, encode, multiple
+from btfkit.fitting.neubtf.guides import multiple
+from btfkit.fitting.neubtf.windows import Window, bounds, inside
 from btfkit.materials.base import Array, Header, Material
 from btfkit.materials.evaluation import answer_pair
 from btfkit.materials.neubtf.material import NeuBTF
-from btfkit.materials.neubtf.paper import NeuBTFPaper
 from btfkit.materials.neumip.material import NeuMIPMaterial
 from btfkit.relief.integration import integrate
 
@@ -82,7 +81,7 @@ class Carrier:
             torch.from_numpy(np.array(arrays[name])) for name in ("mean", "deviation", "axes")
         )
         encoder = Encoder(INPUTS, len(mean), torch.Generator())
-        encoder.load_state_dict(_encoder_of(arrays))
+        encoder.load_state_dict(encoder_of(arrays))
         mix, guidance = Mix.of(arrays), None
         if mix is not None:
             guidance = torch.from_numpy(arrays["copying.guidance"].astype(np.float32))
@@ -171,7 +170,7 @@ class Carrier:
             wanted = augment.resized(self.standardised(material)[None], size, wrap=wrap)[0]
             among = self._shown(window, size, wrap=wrap) > 0.5
             # What lies around the window is looked at, and not asked.
-            at, around, within = _bounds(among)
+            at, around, within = bounds(among, REACH)
             found = in_parts(copier, by.scaled(answer[(..., *around)]), wrap=False, reach=REACH)
             copied, own = found[(0, ..., *within)], answer[(0, ..., *at)]
             mix = Mix.measured(own, copied, wanted[(..., *at)], among[at], by.mix.scale)
@@ -250,93 +249,6 @@ class Carrier:
         return NeuBTF.of_finest(spec, weights, header)
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class PaperCarrier:
-    """The published encoder, and mean and deviation (latents,) of what it gives."""
-
-    encoder: unet.Encoder
-    mean: Tensor
-    deviation: Tensor
-
-    @staticmethod
-    def of(arrays: Mapping[str, NDArray[Any]]) -> PaperCarrier:
-        """From what a file holds; KeyError or RuntimeError where it is not of one."""
-        mean, deviation = (torch.from_numpy(np.array(arrays[n])) for n in ("mean", "deviation"))
-        encoder = unet.Encoder(len(mean), torch.Generator())
-        encoder.load_state_dict(_encoder_of(arrays))
-        return PaperCarrier(encoder.eval(), mean, deviation)
-
-    def carried(
-        self,
-        material: NeuBTFPaper,
-        guidance: Tensor,
-        header: Header,
-        asked: Asked = Asked(),
-    ) -> NeuBTFPaper:
-        """As `Carrier.carried`; nothing is copied.
-
-        Raises:
-            FitError: slopes, of which the published model knows nothing.
-        """
-        if asked.slope is not None:
-            raise FitError(
-                "neubtf-paper has no heights that normals could tell",
-                remedy="fit --model neubtf, or leave --normals out",
-            )
-        with torch.no_grad():
-            encoded = encode(self.encoder, guidance, wrap=header.wrap == "wrap")
-            texture = encoded[0].permute(1, 2, 0) * self.deviation + self.mean
-        kind = material.weights["texture"].dtype
-        weights = {**material.weights, "texture": texture.numpy().astype(kind)}
-        size = (int(texture.shape[0]), int(texture.shape[1]))
-        return NeuBTFPaper(replace(material.spec, size=size), weights, header)
-
-
-# What carries a model, by its name.
-CARRIERS: dict[str, type[Carrier] | type[PaperCarrier]] = {
-    "neubtf": Carrier,
-    "neubtf-paper": PaperCarrier,
-}
-
-
-def inside(window: Window, size: Sequence[int]) -> Tensor:
-    """(h, w) whether each texel lies in a window of a grid of that size."""
-    found = torch.zeros(size[0], size[1], dtype=torch.bool)
-    found[window.slices()] = True
-    return found
-
-
-def _bounds(among: Tensor) -> tuple[tuple[slice, slice], ...]:
-    """The rows and columns of what is set in (h, w); with REACH around; and those in these."""
-    at, around, within = [], [], []
-    for dim, side in ((1, among.shape[0]), (0, among.shape[1])):
-        found = torch.nonzero(among.any(dim=dim))[:, 0]
-        first, stop = int(found[0]), int(found[-1]) + 1
-        begin = max(first - REACH, 0)
-        at.append(slice(first, stop))
-        around.append(slice(begin, min(stop + REACH, side)))
-        within.append(slice(first - begin, stop - begin))
-    return (at[0], at[1]), (around[0], around[1]), (within[0], within[1])
-
-
-def part_of(material: NeuMIPMaterial, part: Window) -> NeuMIPMaterial:
-    """A part of a material of one level, which ends at its borders if it is not the whole."""
-    h, w = material.spec.size
-    if part == Window(0, 0, h, w):
-        return material
-    weights = {
-        name: array[part.slices()] if name.startswith("texture.") else array
-        for name, array in material.weights.items()
-    }
-    # Heights count in tile widths, and the tile is narrower.
-    heights = weights["texture.heights"].astype(np.float32) * (w / part.width)
-    weights["texture.heights"] = heights.astype(weights["texture.heights"].dtype)
-    size = (part.height, part.width)
-    header = replace(material.header, grid=size, wrap="clamp")
-    return type(material)(replace(material.spec, size=size), weights, header)
-
-
 def of_kind(image: Tensor, averaged: bool) -> Tensor:
     """(b, 4, h, w) guidance and what kind it is of: 1 for a mean over lights, else 0."""
     return torch.cat([image, torch.full_like(image[:, :1], float(averaged))], dim=1)
@@ -380,7 +292,8 @@ def errors_in(
     return dict(zip(ERRORS, (errors["psnr"], errors["psnr_log1p"]), strict=True))
 
 
-def _encoder_of(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Tensor]:
+def encoder_of(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Tensor]:
+    """Weights of an encoder among arrays."""
     prefix = "encoder."
     return {
         name.removeprefix(prefix): torch.from_numpy(np.array(value))

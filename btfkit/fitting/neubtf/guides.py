@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
 import torch
@@ -14,22 +14,8 @@ from torch import Tensor
 from btfkit.fitting.neubtf import augment
 from btfkit.fitting.neubtf.settings import Guidance
 from btfkit.fitting.neubtf.unet import STRIDE
+from btfkit.fitting.neubtf.windows import Window
 from btfkit.fitting.pool import Pool
-
-
-@final
-class Window(NamedTuple):
-    """A part of the tile, texels; it may reach around the border."""
-
-    top: int
-    left: int
-    height: int
-    width: int
-
-    def slices(self) -> tuple[slice, slice]:
-        """Rows and columns of a window that does not reach around the border."""
-        rows = slice(self.top, self.top + self.height)
-        return rows, slice(self.left, self.left + self.width)
 
 
 @final

@@ -27,10 +27,11 @@ from btfkit.fitting.interpolation import images_of
 from btfkit.fitting.loop import Generators, Trainable, restore_tensors, tensors_of
 from btfkit.fitting.neubtf import augment
 from btfkit.fitting.neubtf.data import PairDirections, first_latents, frontal_slice
-from btfkit.fitting.neubtf.guides import Guide, Guides, Window, encode
+from btfkit.fitting.neubtf.guides import Guide, Guides, encode
 from btfkit.fitting.neubtf.settings import PaperSettings
 from btfkit.fitting.neubtf.siren import ParallaxHead, Renderer, on_disc
 from btfkit.fitting.neubtf.unet import Encoder
+from btfkit.fitting.neubtf.windows import Window
 from btfkit.fitting.pool import Pool
 from btfkit.fitting.schedule import pace
 from btfkit.materials.base import Header

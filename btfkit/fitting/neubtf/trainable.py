@@ -32,15 +32,15 @@ from btfkit.fitting.neubtf.carrier import (
     colour_axes,
     errors_in,
     of_kind,
-    part_of,
     tied_features,
 )
 from btfkit.fitting.neubtf.copying import Mix
 from btfkit.fitting.neubtf.data import frontal_slice
 from btfkit.fitting.neubtf.encoder import Encoder
-from btfkit.fitting.neubtf.guides import Guide, Guides, Window
+from btfkit.fitting.neubtf.guides import Guide, Guides
 from btfkit.fitting.neubtf.muon import Muon
 from btfkit.fitting.neubtf.settings import Settings
+from btfkit.fitting.neubtf.windows import Window, part_of
 from btfkit.fitting.neumip.data import TexelSource
 from btfkit.fitting.neumip.trainable import NeuMIP
 from btfkit.fitting.optimisers import Adam, Optimiser
