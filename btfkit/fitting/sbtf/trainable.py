@@ -31,8 +31,6 @@ from btfkit.relief.relief import Relief
 
 # Steps between looks at outlines, and rows of a look; steps between looks at the thickness.
 _OUTLINE_STEPS, _OUTLINE_ROWS, _THICKNESS_STEPS = 4, 2048, 100
-# Share of the depth by which heights sink at a look, so that only what stops rays stands high.
-_SINKING = 3e-4
 
 
 @final
@@ -196,8 +194,6 @@ class SBTF(Marching[Settings]):
             found, batch.uv[rows], batch.view[rows], batch.curvature[rows], passes,
             aspect=self.layout.aspect, wrap=self.layout.wrap,
         )  # fmt: skip
-        if self._opacity is None:
-            step = step + np.float32(_SINKING * min(float(found.heights.min()), 0.0))
 
         def move(_: Array, texels: Array) -> None:
             surface = self.layout.surface(texels)
