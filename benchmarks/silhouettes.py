@@ -179,7 +179,7 @@ def radii() -> Rows:
         for low, high in ((2, 5), (5, 10), (10, 20)):
             rows = band.rows & (thick > 1 / high) & (thick <= 1 / low)
             query = Query(*(part[rows] for part in band.query))
-            for looks in (16, 32):
+            for looks in (12, 32):
                 opacity = model_of(relief, looks=looks).evaluate(*query).opacity
                 found[f"{low}-{high}, {looks} looks"] = metrics.iou(opacity, band.opacity[rows])
         yield {"material": name, **found}

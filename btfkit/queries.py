@@ -127,7 +127,10 @@ def flat_drift(drift: ArrayLike, shape: tuple[int, ...]) -> Array:
         raise ValueError(
             f"drift has leading shape {part.shape[:-1]}; the other parts have {shape}"
         ) from error
-    return np.ascontiguousarray(np.clip(every, -MOST_DRIFT, MOST_DRIFT)).reshape(-1, 4)
+    flat = np.ascontiguousarray(every).reshape(-1, 4)
+    if len(flat) and -MOST_DRIFT <= flat.min() and flat.max() <= MOST_DRIFT:
+        return flat
+    return np.clip(flat, -MOST_DRIFT, MOST_DRIFT)
 
 
 def _rows(part: NDArray[Any], shape: tuple[int, ...], last: tuple[int, ...]) -> NDArray[Any]:

@@ -448,13 +448,11 @@ class Material(ABC):
         self, query: Query, drift: Array | None, opacity: Array, *, below: bool
     ) -> tuple[Prepared, Array | None]:
         """What is to be answered, and the drift of its rays where the model heeds it."""
-        if drift is not None:
-            finite = np.isfinite(drift).all(axis=1)
-            if not finite.all():
-                # What is not finite in one part is masked, whichever it is.
-                query = query._replace(
-                    curvature=np.where(finite, query.curvature, np.nan).astype(np.float32)
-                )
+        # Held within MOST_DRIFT, only what is no number has no finite sum.
+        if drift is not None and not np.isfinite(drift.sum()):
+            # What is not finite in one part is masked, whichever it is.
+            bend = np.where(np.isfinite(drift).all(axis=1), query.curvature, np.nan)
+            query = query._replace(curvature=bend.astype(np.float32))
         ready = prepare(*query, opacity, wrap=self.header.wrap == "wrap", below=below)
         self._warn_of_missing_parts(ready)
         if drift is None or not self.has_drift:

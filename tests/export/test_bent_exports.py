@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import copy
 import json
 import shutil
 import subprocess
@@ -51,7 +52,13 @@ def asked(count: int = 1500) -> Asked:
 
 
 def wanted(material: Material, queries: Asked) -> Response:
-    """Answers of single rays, which exports follow: of no footprint's several."""
+    """Answers of single rays, which exports follow: of no footprint's several.
+
+    Of the program itself: the kernel reads heights in steps of 1/65535 of their range.
+    """
+    material = copy.copy(material)
+    if isinstance(material, SBTF):
+        material._kernel = None
     sharp = mock.patch.object(SBTF, "_may_pass", return_value=np.empty(0, np.intp))
     with warnings.catch_warnings(), sharp:
         # Counts of what is masked, and of curvature that no surface has.

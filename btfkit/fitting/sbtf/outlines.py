@@ -67,8 +67,10 @@ def carved(
     heights = np.clip(heights, bottom, 0)
     band = convex[lowest[convex] <= -bottom]
     rng, count = np.random.default_rng(seed), min(_SWEPT * heights.size, _MOST_SWEPT, len(band))
+    # Of a sheet with holes rays say nothing where it is open, and nothing would hold it up.
+    sinking = _SINKING * bottom if opacity is None else 0.0
     for k in range(_SWEEPS):
-        heights = heights + np.float32(_SINKING * bottom * (1 - k / _SWEEPS))
+        heights = heights + np.float32(sinking * (1 - k / _SWEEPS))
         rows = rng.choice(band, count, replace=False)
         heights = heights + moved(
             Heights(heights, scale, curved=True), queries.uv[rows], queries.view[rows],
@@ -171,9 +173,8 @@ def moved(
         uv: (b, 2). view: (b, 3). curvature: (b,) 1/tile width. passes: (b,) what is known.
         share: of each gap that is closed.
     """
-    rays = bent.rays_of(found, view, curvature, aspect)
-    open_ = np.flatnonzero(~rays.reaches)
-    rays = bent.Rays(*(part[open_] for part in rays if part is not None))
+    open_ = np.flatnonzero(~bent.rays_of(found, view, curvature, aspect).reaches)
+    rays = bent.rays_of(found, view[open_], curvature[open_], aspect)
     uv, passes = uv[open_], passes[open_]
     closest, place = np.full(len(open_), np.inf, found.heights.dtype), uv.copy()
     for k in range(1, _LOOKS):

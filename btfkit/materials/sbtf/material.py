@@ -117,7 +117,7 @@ class SBTF(NeuMIPMaterial):
         if not len(bend):
             return None
         ends = float(bend.min()), float(bend.max())
-        if ends == (0, 0):
+        if not any(ends):
             return None
         low, high = self.sharpest
         if ends[0] >= low and ends[1] <= high:

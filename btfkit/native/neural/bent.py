@@ -188,8 +188,8 @@ def meet(
     way = met(high, low, gap, under)
     way = np.where(opaque, way, rays.stop)
     depth = -way * rays.share * np.asarray(found.scale, way.dtype)
-    beside = None if rays.drift is None else aside(rays.drift, way)
-    return Crossing(depth, opaque.astype(way.dtype), way, rays.bend * way, beside)
+    off = None if rays.drift is None else aside(rays.drift, way)
+    return Crossing(depth, opaque.astype(way.dtype), way, rays.bend * way, off)
 
 
 def gap_over(found: Heights, uv: Array, height: Array, *, wrap: bool) -> Array:

@@ -62,7 +62,7 @@ struct Surface {
     bool wrap;
     const float* opacity;  // of the heights, or null
     int looks;             // at most along a ray that may pass
-    const Quads *quads, *cover_quads;  // the same, or null
+    QuadView quads, cover_quads;  // the same, where `at` is not null
 
     MEMBER Corners around(F u, F v) const {
         return corners_of(u, v, all(w), all(h), I{}, wrap);
@@ -71,11 +71,11 @@ struct Surface {
     // How far a height z lies above what there is; in holes there is nothing.
     MEMBER F gap(F z, F u, F v) const {
         F height, cover;
-        if (quads) {
+        if (quads.at) {
             F fx, fy;
             const I at = quad_at(u, v, fx, fy);
-            height = read_quad(*quads, at, fx, fy);
-            if (opacity) cover = read_quad(*cover_quads, at, fx, fy);
+            height = read_quad(quads, at, fx, fy);
+            if (opacity) cover = read_quad(cover_quads, at, fx, fy);
         } else {
             const Corners c = around(u, v);
             height = read(heights, c);
@@ -110,9 +110,9 @@ struct Surface {
         const U last = U{} + uint32_t((int32_t(w) + 1) * (int32_t(h) + 1) - 1);
         return (I)((U)at < last ? (U)at : last);
     }
-    MEMBER F read_quad(const Quads& from, I at, F fx, F fy) const {
+    MEMBER F read_quad(QuadView from, I at, F fx, F fy) const {
         I upper, lower;
-        gathered_halves(from.at.data(), at, upper, lower);
+        gathered_halves(from.at, at, upper, lower);
         typedef uint32_t U __attribute__((vector_size(sizeof(I)), may_alias));
         const F a = __builtin_convertvector(lower & 0xffff, F);
         const F b = __builtin_convertvector((I)((U)lower >> 16), F);

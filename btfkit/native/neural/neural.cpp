@@ -369,8 +369,8 @@ class Model {
         if (frozen_) {
             b.top = top_;
             b.bottom = bottom_;
-            b.quads = quads_.at.empty() ? nullptr : &quads_;
-            b.cover_quads = &cover_quads_;
+            b.quads = quads_.view();
+            b.cover_quads = cover_quads_.view();
             return;
         }
         float top = -INFINITY, bottom = INFINITY;

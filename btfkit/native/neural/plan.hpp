@@ -157,11 +157,17 @@ constexpr float kQuadMost = 65535.f;
 // A plane of numbers for marches, which look at many: the four around each place, 16 bits each of
 // the way from the least to the greatest, side by side. One row and one column come before it, for
 // places between the last and the first, or before the first.
+struct QuadView {
+    const uint64_t* at = nullptr;
+    float low = 0, step = 0;
+};
+
 struct Quads {
     std::vector<uint64_t> at;
     float low = 0, step = 0;
 
     Quads() = default;
+    QuadView view() const { return {at.empty() ? nullptr : at.data(), low, step}; }
     Quads(const float* from, int h, int w, bool wrap) : at(size_t(h + 1) * (w + 1)) {
         const auto [least, most] = std::minmax_element(from, from + size_t(h) * w);
         low = *least;
@@ -187,7 +193,7 @@ struct Batch {
     const float *drift = nullptr;      // four a query, of rays that curvature bends; null is 0
     const float *target = nullptr, *weight = nullptr;
     float top = 0, bottom = 0;  // of the heights
-    const Quads *quads = nullptr, *cover_quads = nullptr;  // of frozen curved heights, or null
+    QuadView quads, cover_quads;  // of frozen curved heights; else without `at`
 };
 
 struct Gradient {
