@@ -14,6 +14,7 @@ from btfkit.cli.bar import Bar
 from btfkit.cli.guessed import Guessed, of_coverage
 from btfkit.cli.options import (
     DurationType,
+    FiniteType,
     LocationType,
     NumbersType,
     force_option,
@@ -65,7 +66,7 @@ btfkit render wool.neumip.safetensors --sweep view -o wool.webp --shape torus"""
               help="Ends with the passes finished by then; the first always is.")  # fmt: skip
 @click.option(
     "--exposure",
-    type=click.FloatRange(-100, 100),
+    type=FiniteType(-100, 100),
     default=0.0,
     show_default=True,
     help="Stops, PNG only.",
@@ -78,7 +79,7 @@ btfkit render wool.neumip.safetensors --sweep view -o wool.webp --shape torus"""
               help="An animation: the light or the eye goes round, or detail is lost.")  # fmt: skip
 @click.option("--frames", type=click.IntRange(2, 10000), default=36, show_default=True,
               help="Pictures of a sweep.")  # fmt: skip
-@click.option("--fps", type=click.FloatRange(1, 120), default=12, show_default=True,
+@click.option("--fps", type=FiniteType(1, 120), default=12, show_default=True,
               help="Of a sweep.")  # fmt: skip
 @click.option("--pairs", type=click.IntRange(2, 16),
               help="A table of so many views by so many lights, texel by texel.")  # fmt: skip
