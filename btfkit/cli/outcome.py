@@ -93,7 +93,7 @@ def verb(
             with (
                 reading(read),
                 warnings.catch_warnings(record=True) as caught,
-                Bar(name, quiet=quiet) as bar,
+                Bar(name, quiet=quiet, lines=not as_json) as bar,
             ):
                 warnings.simplefilter("always", UserWarning)
                 outcome = function(bar, **options)

@@ -128,7 +128,8 @@ def render_verb(
         raise click.UsageError("--env-turn, --exposure and --background take finite numbers")
     shot = _shot(size, **chosen)
     kind = "compare" if compare else "pairs" if pairs else None
-    suffix = ".webp" if sweep else f".{kind}.png" if kind else ".png"
+    # SOURCE.png might be the photograph that it was made of.
+    suffix = ".sweep.webp" if sweep else f".{kind or 'render'}.png"
     final = out or Path(stem(source) + suffix)
     if sweep:
         animation.check_name(final)
