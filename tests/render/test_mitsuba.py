@@ -131,6 +131,42 @@ def test_a_white_surface_in_white_surroundings_is_white(mi: Any, tmp_path: Path)
     assert np.array(picture).mean() == pytest.approx(1, abs=0.01)
 
 
+def test_what_a_path_tracer_asks_is_found_once_and_is_the_same_as_asked_apart(
+    mi: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from btfkit.render.mitsuba.traced import Traced
+
+    asked, view = [0], Traced._view
+
+    def counted(self: Any, si: Any, active: Any) -> Any:
+        asked[0] += 1
+        return view(self, si, active)
+
+    monkeypatch.setattr(Traced, "_view", counted)
+
+    def drawn(integrator: str) -> np.ndarray:
+        asked[0] = 0
+        scene = mi.load_dict({
+            "type": "scene", "light": {"type": "constant"},
+            "integrator": {"type": integrator, "max_depth": 3},
+            "ball": {"type": "sphere", "bsdf": plugin(mi, "neumip", tmp_path, repeat=2.0)},
+            "sensor": {"type": "perspective", "fov": 40, "to_world":
+                       mi.ScalarTransform4f().look_at([0, -4, 1], [0, 0, 0], [0, 0, 1]),
+                       "film": {"type": "hdrfilm", "width": 16, "height": 16}},
+        })  # fmt: skip
+        return np.array(mi.render(scene, spp=64, seed=1))
+
+    once, calls = drawn("path"), asked[0]
+    monkeypatch.setattr("btfkit.render.mitsuba.traced._variables", lambda *_: object())
+    apart, more = drawn("path"), asked[0]
+    assert more == 2 * calls
+    # The same samples; sums may be in another order.
+    np.testing.assert_allclose(once, apart, rtol=1e-4, atol=1e-5)
+    # It asks for value, density and sample apart, with other samples.
+    assert drawn("volpath").mean() == pytest.approx(once.mean(), rel=0.02)
+    assert once.std() > 0.05
+
+
 def with_sharp_lobes(name: str) -> Any:
     """A material of random numbers that draws from sharp, tilted lobes."""
     finest = np.tile(np.float32([0.4, -0.2, 0.15, 0.7, 0.3]), (6, 9, 1))
