@@ -46,7 +46,7 @@ btfkit render wool.neumip.safetensors --compare wool.btf.zarr --shape cylinder
 btfkit render wool.neumip.safetensors --sweep view -o wool.webp --shape torus""",
 )
 @click.argument("source", metavar="MODEL_OR_BTF", type=LocationType())
-@out_option("*.png or *.jpg (sRGB), *.exr (linear), of a sweep *.webp or *.mp4; by default here")
+@out_option("*.png, *.jpg (sRGB), *.exr (linear), *.webp, *.mp4 (sweep); default SOURCE.render.png")
 @click.option("--shape", default="plane", show_default=True,
               help="plane, sphere, cylinder, torus, FILE.obj or FILE.ply.")  # fmt: skip
 @click.option("--light", "lights", type=_ANGLES, multiple=True,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 import warnings
@@ -10,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import needs
 import numpy as np
 import pytest
 from cases import directions, made
@@ -32,22 +32,27 @@ from btfkit.render.preview import Scene, render
 from btfkit.render.variants import usable
 from btfkit.shapes.catalogue import shape_of
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        importlib.util.find_spec("mitsuba") is None,
-        reason="Mitsuba is missing: pip install 'btfkit[mitsuba]'",
-    ),
-]
+pytestmark = pytest.mark.slow
 VARIANT = "llvm_ad_rgb"
 
 
-@pytest.fixture(scope="module")
-def mi() -> Any:
-    """Mitsuba with the plugin, in a variant that runs here."""
+@pytest.fixture(autouse=True, scope="module")
+def installed() -> None:
+    """All tests here need Mitsuba."""
+    needs.module("mitsuba", install="'btfkit[mitsuba]'")
+
+
+def usable_here() -> None:
+    """The variant, or the test is skipped."""
     amiss = usable(VARIANT)
     if amiss:
-        pytest.skip(amiss)
+        needs.lacking("mitsuba", amiss)
+
+
+@pytest.fixture(scope="module")
+def mi(installed: None) -> Any:
+    """Mitsuba with the plugin, in a variant that runs here."""
+    usable_here()
     import mitsuba
 
     mitsuba.set_variant(VARIANT)
@@ -422,9 +427,7 @@ def test_without_a_variant_the_plugin_says_what_to_do() -> None:
 
 
 def test_the_exported_scene_is_rendered_by_its_own_program(tmp_path: Path) -> None:
-    amiss = usable(VARIANT)
-    if amiss:
-        pytest.skip(amiss)
+    usable_here()
     export(made("lambert"), "mitsuba", tmp_path / "out")
     subprocess.run([sys.executable, tmp_path / "out" / "render.py", "4"], check=True)
     picture = images.decode(
