@@ -147,7 +147,7 @@ def _march(
     gap = above(start, active)
     _, low, high, under, gap, _ = dr.while_loop(
         (mi.Float(1), start, start, gap, gap, mi.Bool(active)), lambda *state: state[-1], look,
-        max_iterations=most,
+        max_iterations=most, mode="symbolic",
     )  # fmt: skip
     first = _met(high, low, gap, under)
     rest = above(first, active)
