@@ -6,8 +6,9 @@ import errno
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 
 # What must fit into a folder before anybody works for hours on what shall lie there.
@@ -16,6 +17,18 @@ _LEAST_ROOM = 1 << 20
 _LIST = ".btfkit"
 # What a Zarr group is known by.
 _GROUP = "zarr.json"
+# What the present task reads; nothing is written there.
+_read: ContextVar[tuple[Path, ...]] = ContextVar("read", default=())
+
+
+@contextmanager
+def reading(paths: Iterable[str | os.PathLike[str]]) -> Iterator[None]:
+    """While it lasts, no output replaces one of these, under whatever name and with any `force`."""
+    token = _read.set((*_read.get(), *map(Path, paths)))
+    try:
+        yield
+    finally:
+        _read.reset(token)
 
 
 def refuse_existing(
@@ -29,12 +42,14 @@ def refuse_existing(
         store: whether that folder is a store.
 
     Raises:
-        FileExistsError: it exists and `force` is False; or it is of another kind, or a folder with
-            files that btfkit did not write, which nothing replaces.
+        FileExistsError: it exists and `force` is False; or it is what is read (`reading`), or of
+            another kind, or a folder with files that btfkit did not write: nothing replaces it.
         FileNotFoundError: its folder is missing.
         OSError: nothing can be written into its folder, or the disk is full; names `path`.
     """
     final = Path(path)
+    if final.exists() and any(each.exists() and each.samefile(final) for each in _read.get()):
+        raise FileExistsError(f"{final} is what is read: nothing replaces it; name another output")
     if final.is_dir() and not folder:
         raise FileExistsError(f"{final} is a folder; name a file")
     if folder and not final.name:

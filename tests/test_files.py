@@ -10,7 +10,7 @@ import sources
 import btfkit
 from btfkit.cli import btfkit as command
 from btfkit.cli.outcome import run
-from btfkit.files import refuse_existing, replace_folder, whole_folder
+from btfkit.files import reading, refuse_existing, replace_folder, whole, whole_folder
 from btfkit.ingest import ingest
 from btfkit.materials import file
 from btfkit.materials.base import Header
@@ -31,6 +31,44 @@ def test_a_folder_of_ours_is_replaced_only_when_asked(tmp_path: Path) -> None:
         refuse_existing(path, force=False, folder=True)
     _folder(path, "three")
     assert sorted(p.name for p in path.iterdir()) == [".btfkit", "three"]
+
+
+def test_what_is_read_is_never_replaced(tmp_path: Path) -> None:
+    """However it is called, forced or not: a file, a link to it, a folder."""
+    read, folder = tmp_path / "a.png", _folder(tmp_path / "b", "one")
+    read.write_text("years")
+    (tmp_path / "link.png").symlink_to(read)
+    with reading([read, folder]):
+        for name in ("a.png", "../" + tmp_path.name + "/a.png", "link.png"):
+            with (
+                pytest.raises(FileExistsError, match="is what is read"),
+                whole(tmp_path / name, force=True),
+            ):
+                pass
+        with pytest.raises(FileExistsError, match="is what is read"):
+            refuse_existing(folder, force=True, folder=True)
+        assert refuse_existing(tmp_path / "c.png", force=False) == tmp_path / "c.png"
+    assert read.read_text() == "years"
+    assert refuse_existing(read, force=True) == read
+
+
+def test_every_verb_keeps_what_it_reads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("m.safetensors", "q.npz", "p.png", "r.exr", "n.html"):
+        Path(name).write_text("years")
+    for asked in (
+        ["query", "m.safetensors", "q.npz", "-o", "q.npz"],
+        ["render", "m.safetensors", "--compare", "p.png", "-o", "p.png"],
+        ["tile", "p.png", "-o", "p.png"],
+        ["heightfield", "m.safetensors", "--truth", "r.exr", "-o", "r.exr"],
+        ["view", "m.safetensors", "--measured", "n.html", "-o", "n.html"],
+        ["eval", "m.safetensors", "n.html", "--report", "n.html"],
+    ):
+        assert run(command, [*asked, "--force"]) == 1, asked
+        assert "is what is read" in capsys.readouterr().err.replace("\n", " "), asked
+    assert {path.read_text() for path in tmp_path.iterdir()} == {"years"}
 
 
 def test_what_others_put_into_a_folder_is_never_removed(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from btfkit.cli.bar import Bar
 from btfkit.cli.many import cluster_option, over, several
 from btfkit.cli.options import (
     DurationType,
+    FiniteType,
     SettingType,
     completed,
     fitted_models,
@@ -52,7 +53,7 @@ btfkit bench wool.btf.zarr --questions && btfkit bench wool.btf.zarr --answers o
     help="Every store or source of a folder; pairs held out by their angle to the nearest other.",
 )  # fmt: skip
 @click.option(
-    "--holdout", type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    "--holdout", type=FiniteType(0, 1, min_open=True, max_open=True),
     help="Share of pairs, or rows, held out; by default 0.05, with --real 0.1.",
 )  # fmt: skip
 @cluster_option

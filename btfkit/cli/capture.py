@@ -24,6 +24,7 @@ _TWIN = ("--fault", "--truth", "--perfect", "--without", "--sample", "--seed")
 
 @verb(
     "capture",
+    writes=("out", "truth"),
     example="""btfkit capture --device mock --plan demo -o run --truth truth.btf.zarr
 btfkit capture --device usb:RIG7 --plan bonn81 --dry-run
 btfkit capture --device usb:RIG7 -o run --resume""",

@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 _HERE = "-"
 
 
-@verb("eval", example="btfkit eval wool.neubtf.safetensors wool.btf.zarr --json")
+@verb(
+    "eval", writes=("report",), example="btfkit eval wool.neubtf.safetensors wool.btf.zarr --json"
+)
 @click.argument("model", type=click.Path(path_type=Path))
 @click.argument("source", type=LocationType())
 @click.option("--all", "everything", is_flag=True, help="All pairs, those trained on as well.")

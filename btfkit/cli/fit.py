@@ -14,6 +14,7 @@ from btfkit.cli.bar import Bar
 from btfkit.cli.many import cluster_option, outputs, over, the_one
 from btfkit.cli.options import (
     DurationType,
+    FiniteType,
     LocationType,
     SettingType,
     completed,
@@ -69,7 +70,7 @@ btfkit fit *.btf.zarr --model neumip --cluster tcp://host:8786 -o models""",
 @click.option("--steps", type=click.IntRange(min=0), help="Train this many steps instead.")
 @click.option(
     "--holdout",
-    type=click.FloatRange(0, 1, max_open=True),
+    type=FiniteType(0, 1, max_open=True),
     default=0.05,
     show_default=True,
     help="Share of the direction pairs (or query rows) kept for the test.",

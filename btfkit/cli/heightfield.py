@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from btfkit.cli.bar import Bar
-from btfkit.cli.options import DurationType, force_option, out_option, seed_option, stem
+from btfkit.cli.options import DurationType, FiniteType, force_option, out_option, seed_option, stem
 from btfkit.cli.outcome import Outcome, verb
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 @verb(
     "heightfield",
+    writes=("out", "mesh"),
     example="""btfkit heightfield wool.btf.zarr -o wool.exr --mesh wool.ply --report
 btfkit heightfield wool.neumip.safetensors""",
 )
@@ -31,7 +32,7 @@ btfkit heightfield wool.neumip.safetensors""",
               help="A neumip of this BTF: its heights instead of a fit.")  # fmt: skip
 @click.option("--budget", type=DurationType(), default="20s", show_default=True,
               help="Time to find heights by parallax; the rest takes what it takes.")  # fmt: skip
-@click.option("--holdout", type=click.FloatRange(0, 1, max_open=True), default=0.05,
+@click.option("--holdout", type=FiniteType(0, 1, max_open=True), default=0.05,
               show_default=True, help="Share of pairs kept for the test, 12 at most.")  # fmt: skip
 @click.option("--no-preview", is_flag=True, help="No picture beside the relief.")
 @seed_option

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -77,6 +78,19 @@ class NumbersType(click.ParamType[tuple[Any, ...]]):
         if len(numbers) != self._count:
             self.fail(f"{value!r}; expected {self.name}", param, ctx)
         return numbers
+
+
+@final
+class FiniteType(click.FloatRange):
+    """A number of a range; neither infinite nor NaN, which compares with no end of it."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        number: float = click.FLOAT.convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number", param, ctx)
+        return super().convert(value, param, ctx)
 
 
 @final

@@ -10,7 +10,7 @@ import shlex
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
@@ -18,6 +18,7 @@ from typing import Any, final
 import click
 
 from btfkit.cli.bar import Bar
+from btfkit.files import reading
 from btfkit.jsonvalues import plain
 
 DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
@@ -69,7 +70,11 @@ class _Command(click.Command):
 
 
 def verb(
-    name: str, *, example: str, more: Callable[[], str] | None = None
+    name: str,
+    *,
+    example: str,
+    more: Callable[[], str] | None = None,
+    writes: Sequence[str] = ("out",),
 ) -> Callable[[Callable[..., Outcome]], click.Command]:
     """Make a verb of a function that takes a `Bar` and its options, and returns an `Outcome`.
 
@@ -77,13 +82,19 @@ def verb(
         name: the verb.
         example: command lines that `--help` shows.
         more: what stands at its end, asked for when it is shown.
+        writes: options that name what is written; nothing written replaces what others name.
     """
 
     def decorate(function: Callable[..., Outcome]) -> click.Command:
         @functools.wraps(function)
         def call(*, as_json: bool, quiet: bool, debug: bool, **options: Any) -> None:
             _manners.as_json, _manners.quiet, _manners.debug = as_json, quiet, debug
-            with warnings.catch_warnings(record=True) as caught, Bar(name, quiet=quiet) as bar:
+            read = _named(value for key, value in options.items() if key not in writes)
+            with (
+                reading(read),
+                warnings.catch_warnings(record=True) as caught,
+                Bar(name, quiet=quiet, lines=not as_json) as bar,
+            ):
                 warnings.simplefilter("always", UserWarning)
                 outcome = function(bar, **options)
             _say(outcome, sorted({str(w.message) for w in caught if _is_ours(w)}))
@@ -100,6 +111,17 @@ def verb(
         return command
 
     return decorate
+
+
+def _named(values: Iterable[Any]) -> Iterator[Path]:
+    """What options name that is there: paths, and files that words happen to be."""
+    for value in values:
+        if isinstance(value, tuple):
+            yield from _named(value)
+        elif isinstance(value, Path):
+            yield value
+        elif isinstance(value, str) and "\0" not in value and os.path.isfile(value):
+            yield Path(value)
 
 
 def run(group: click.Group, arguments: Sequence[str]) -> int:

@@ -10,7 +10,7 @@ import click
 
 from btfkit.cli.bar import Bar
 from btfkit.cli.guessed import of_coverage
-from btfkit.cli.options import force_option, out_option, seed_option, stem, the_only
+from btfkit.cli.options import FiniteType, force_option, out_option, seed_option, stem, the_only
 from btfkit.cli.outcome import Outcome, verb
 from btfkit.cli.preview import of_material, preview_option
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     help="A NeuBTF with its encoder; several with --mask.",
 )
 @out_option("The model to write; by default GUIDANCE.neubtf.safetensors here")
-@click.option("--scale", type=click.FloatRange(min=0, min_open=True), default=1.0)
+@click.option("--scale", type=FiniteType(min=0, min_open=True), default=1.0)
 @click.option("--tileable", is_flag=True, help="Make the guidance tile first.")
 @click.option(
     "--normals",

@@ -14,6 +14,7 @@ from btfkit.cli.bar import Bar
 from btfkit.cli.guessed import Guessed, of_coverage
 from btfkit.cli.options import (
     DurationType,
+    FiniteType,
     LocationType,
     NumbersType,
     force_option,
@@ -45,7 +46,7 @@ btfkit render wool.neumip.safetensors --compare wool.btf.zarr --shape cylinder
 btfkit render wool.neumip.safetensors --sweep view -o wool.webp --shape torus""",
 )
 @click.argument("source", metavar="MODEL_OR_BTF", type=LocationType())
-@out_option("*.png or *.jpg (sRGB), *.exr (linear), of a sweep *.webp or *.mp4; by default here")
+@out_option("*.png, *.jpg (sRGB), *.exr (linear), *.webp, *.mp4 (sweep); default SOURCE.render.png")
 @click.option("--shape", default="plane", show_default=True,
               help="plane, sphere, cylinder, torus, FILE.obj or FILE.ply.")  # fmt: skip
 @click.option("--light", "lights", type=_ANGLES, multiple=True,
@@ -65,7 +66,7 @@ btfkit render wool.neumip.safetensors --sweep view -o wool.webp --shape torus"""
               help="Ends with the passes finished by then; the first always is.")  # fmt: skip
 @click.option(
     "--exposure",
-    type=click.FloatRange(-100, 100),
+    type=FiniteType(-100, 100),
     default=0.0,
     show_default=True,
     help="Stops, PNG only.",
@@ -78,7 +79,7 @@ btfkit render wool.neumip.safetensors --sweep view -o wool.webp --shape torus"""
               help="An animation: the light or the eye goes round, or detail is lost.")  # fmt: skip
 @click.option("--frames", type=click.IntRange(2, 10000), default=36, show_default=True,
               help="Pictures of a sweep.")  # fmt: skip
-@click.option("--fps", type=click.FloatRange(1, 120), default=12, show_default=True,
+@click.option("--fps", type=FiniteType(1, 120), default=12, show_default=True,
               help="Of a sweep.")  # fmt: skip
 @click.option("--pairs", type=click.IntRange(2, 16),
               help="A table of so many views by so many lights, texel by texel.")  # fmt: skip
@@ -127,7 +128,8 @@ def render_verb(
         raise click.UsageError("--env-turn, --exposure and --background take finite numbers")
     shot = _shot(size, **chosen)
     kind = "compare" if compare else "pairs" if pairs else None
-    suffix = ".webp" if sweep else f".{kind}.png" if kind else ".png"
+    # SOURCE.png might be the photograph that it was made of.
+    suffix = ".sweep.webp" if sweep else f".{kind or 'render'}.png"
     final = out or Path(stem(source) + suffix)
     if sweep:
         animation.check_name(final)

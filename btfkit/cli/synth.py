@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, final
 import click
 
 from btfkit.cli.bar import Bar
-from btfkit.cli.options import NumbersType, force_option, out_option, seed_option
+from btfkit.cli.options import FiniteType, NumbersType, force_option, out_option, seed_option
 from btfkit.cli.outcome import Outcome, verb
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class FloatsType(click.ParamType[tuple[float, ...]]):
 )
 @click.option(
     "--lamp-degrees",
-    type=click.FloatRange(0, 90),
+    type=FiniteType(0, 90),
     default=0.0,
     help="Angular diameter of the lamp.  [default: 0, a distant point]",
 )

@@ -27,8 +27,12 @@ def lights() -> Floats:
 
 
 def picture(material: Material, *, size: int = 160, shape: str = "sphere") -> bytes:
-    """PNG bytes of a small square picture of a material on a shape."""
-    form = shape_of(shape, repeat=_TILES, aspect=material.header.aspect, picture=1.0)
+    """PNG bytes of a small square picture of a material on a shape.
+
+    Of a sample that does not tile one copy, whose border lies where the front ends.
+    """
+    repeat = _TILES if material.header.wrap == "wrap" else 1
+    form = shape_of(shape, repeat=repeat, aspect=material.header.aspect, picture=1.0)
     scene = Scene(material, form, lights(), irradiance=IRRADIANCE)
     seen = render(scene, size=(size, size), samples=4)
     behind = (1 - seen.cover[..., None]) * np.asarray(GREY, np.float32)

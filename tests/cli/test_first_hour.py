@@ -275,6 +275,34 @@ def test_the_bar_names_its_part_and_the_time_of_the_whole(monkeypatch: pytest.Mo
         assert task.total == 1000
 
 
+def test_without_a_terminal_lines_tell_how_far_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import time
+
+    from btfkit.cli import bar as bars
+
+    monkeypatch.setattr(bars, "_FIRST_S", 0.02)
+    monkeypatch.setattr(bars, "_EVERY_S", 0.02)
+    told = {}
+    for lines in (False, True):
+        with bars.Bar("fit", quiet=False, lines=lines) as bar:
+            bar.phase("reading")
+            time.sleep(0.2)
+            bar(120, 300)
+            time.sleep(0.2)
+        told[lines] = capsys.readouterr().err.splitlines()
+        # Nothing is told when it is over.
+        time.sleep(0.05)
+        assert capsys.readouterr().err == ""
+    assert told[False] == []
+    assert told[True][0] == "fit: reading, 0:00"
+    assert told[True][-1] == "fit: reading, 120 of 300, 0:00"
+    with bars.Bar("fit", quiet=True, lines=True):
+        time.sleep(0.05)
+    assert capsys.readouterr().err == ""
+
+
 # --- interruptions
 
 

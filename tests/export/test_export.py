@@ -109,6 +109,24 @@ def test_arrays_and_their_reader_in_numpy_answer_as_the_material(
         agree(answers["rgb"], answers["opacity"], wanted(material, queries))
 
 
+def test_what_is_too_short_for_a_direction_is_none_in_numpy_either(tmp_path: Path) -> None:
+    material = made("lambert")
+    npz.write(material, material.program(), tmp_path)
+    light = np.float32([[0, 0, 9e-31], [0, 0, 1.1e-30], [0, 0, 0], [3e-20, 0, 4e-20]])
+    asked = {"uv": np.full((4, 2), 0.3, np.float32), "light": light,
+             "view": np.tile(np.float32([0, 0, 1]), (4, 1)),
+             "footprint": np.full(4, 0.5, np.float32)}  # fmt: skip
+    np.savez(tmp_path / "q.npz", **asked)
+    command = [sys.executable, tmp_path / "evaluate.py", tmp_path / "q.npz", tmp_path / "a.npz"]
+    subprocess.run(command, check=True)
+    with np.load(tmp_path / "a.npz") as answers:
+        rgb = answers["rgb"]
+    with pytest.warns(UserWarning, match="2 of 4 queries"):
+        known = material.evaluate(asked["uv"], light, asked["view"]).reflectance
+    np.testing.assert_allclose(rgb, known, atol=1e-6)
+    assert (rgb.max(axis=1) > 0).tolist() == [False, True, False, True]
+
+
 @every_case
 @pytest.mark.slow
 def test_the_header_compiles_without_a_warning_and_answers_as_the_material(

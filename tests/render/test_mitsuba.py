@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 import warnings
@@ -10,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import needs
 import numpy as np
 import pytest
 from cases import directions, made
@@ -32,22 +32,27 @@ from btfkit.render.preview import Scene, render
 from btfkit.render.variants import usable
 from btfkit.shapes.catalogue import shape_of
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        importlib.util.find_spec("mitsuba") is None,
-        reason="Mitsuba is missing: pip install 'btfkit[mitsuba]'",
-    ),
-]
+pytestmark = pytest.mark.slow
 VARIANT = "llvm_ad_rgb"
 
 
-@pytest.fixture(scope="module")
-def mi() -> Any:
-    """Mitsuba with the plugin, in a variant that runs here."""
+@pytest.fixture(autouse=True, scope="module")
+def installed() -> None:
+    """All tests here need Mitsuba."""
+    needs.module("mitsuba", install="'btfkit[mitsuba]'")
+
+
+def usable_here() -> None:
+    """The variant, or the test is skipped."""
     amiss = usable(VARIANT)
     if amiss:
-        pytest.skip(amiss)
+        needs.lacking("mitsuba", amiss)
+
+
+@pytest.fixture(scope="module")
+def mi(installed: None) -> Any:
+    """Mitsuba with the plugin, in a variant that runs here."""
+    usable_here()
     import mitsuba
 
     mitsuba.set_variant(VARIANT)
@@ -129,6 +134,42 @@ def test_a_white_surface_in_white_surroundings_is_white(mi: Any, tmp_path: Path)
     }), spp=256)  # fmt: skip
     # Sampling by the cosine alone would be exact; the mean with light sampling is of 256 x 64.
     assert np.array(picture).mean() == pytest.approx(1, abs=0.01)
+
+
+def test_what_a_path_tracer_asks_is_found_once_and_is_the_same_as_asked_apart(
+    mi: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from btfkit.render.mitsuba.traced import Traced
+
+    asked, view = [0], Traced._view
+
+    def counted(self: Any, si: Any, active: Any) -> Any:
+        asked[0] += 1
+        return view(self, si, active)
+
+    monkeypatch.setattr(Traced, "_view", counted)
+
+    def drawn(integrator: str) -> np.ndarray:
+        asked[0] = 0
+        scene = mi.load_dict({
+            "type": "scene", "light": {"type": "constant"},
+            "integrator": {"type": integrator, "max_depth": 3},
+            "ball": {"type": "sphere", "bsdf": plugin(mi, "neumip", tmp_path, repeat=2.0)},
+            "sensor": {"type": "perspective", "fov": 40, "to_world":
+                       mi.ScalarTransform4f().look_at([0, -4, 1], [0, 0, 0], [0, 0, 1]),
+                       "film": {"type": "hdrfilm", "width": 16, "height": 16}},
+        })  # fmt: skip
+        return np.array(mi.render(scene, spp=64, seed=1))
+
+    once, calls = drawn("path"), asked[0]
+    monkeypatch.setattr("btfkit.render.mitsuba.traced._variables", lambda *_: object())
+    apart, more = drawn("path"), asked[0]
+    assert more == 2 * calls
+    # The same samples; sums may be in another order.
+    np.testing.assert_allclose(once, apart, rtol=1e-4, atol=1e-5)
+    # It asks for value, density and sample apart, with other samples.
+    assert drawn("volpath").mean() == pytest.approx(once.mean(), rel=0.02)
+    assert once.std() > 0.05
 
 
 def with_sharp_lobes(name: str) -> Any:
@@ -386,9 +427,7 @@ def test_without_a_variant_the_plugin_says_what_to_do() -> None:
 
 
 def test_the_exported_scene_is_rendered_by_its_own_program(tmp_path: Path) -> None:
-    amiss = usable(VARIANT)
-    if amiss:
-        pytest.skip(amiss)
+    usable_here()
     export(made("lambert"), "mitsuba", tmp_path / "out")
     subprocess.run([sys.executable, tmp_path / "out" / "render.py", "4"], check=True)
     picture = images.decode(

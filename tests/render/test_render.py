@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from btfkit import directions
@@ -814,7 +814,10 @@ def test_a_damaged_obj_is_refused_in_words(text: str, message: str, tmp_path: Pa
         obj.read(path)
 
 
+# Faces of too few corners are left out, and told.
+@pytest.mark.filterwarnings("ignore:.*left out:UserWarning")
 @settings(max_examples=60)
+@example(b"f")
 @given(st.binary(max_size=200))
 def test_noise_for_an_obj_is_a_format_error(tmp_path_factory: Any, noise: bytes) -> None:
     path = tmp_path_factory.mktemp("noise") / "noise.obj"
@@ -1005,6 +1008,42 @@ def test_surroundings_come_from_files(store: Path, tmp_path: Path) -> None:
         picture.read_surroundings(out, channels=("R", "G", "B"))
 
 
+def test_damaged_surroundings_are_called_by_their_name(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sky = tmp_path / "sky.exr"
+    rng = np.random.default_rng(0)
+    images.write_exr(sky, rng.random((64, 128, 3)).astype(np.float32), ("R", "G", "B"))
+    whole = sky.read_bytes()
+    for size in (len(whole) // 2, 300, 20):
+        sky.write_bytes(whole[:size])
+        assert call("render", store, "-o", tmp_path / "a.png", "--env", sky, "--size", "4x4") == 1
+        said = capsys.readouterr().err
+        assert str(sky) in said
+        # Of the copy that OpenImageIO reads.
+        assert "/tmp/tmp" not in said
+    assert not (tmp_path / "a.png").exists()
+
+
+@pytest.mark.parametrize("option", ["--env", "--shape"])
+def test_a_picture_replaces_nothing_that_it_is_made_of(
+    option: str, store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    read = tmp_path / {"--env": "sky.exr", "--shape": "ball.obj"}[option]
+    images.write_exr(tmp_path / "s.exr", np.ones((4, 8, 3), np.float32), ("R", "G", "B"))
+    (tmp_path / "s.exr").rename(read)
+    before, other = read.read_bytes(), tmp_path / "link.exr"
+    other.symlink_to(read)
+    for out in (read, other):
+        code = call("render", store, option, read, "-o", out, "--force", "--size", "4x4")
+        assert code == 1
+        said = capsys.readouterr().err.replace("\n", " ")
+        if out.suffix == ".exr":
+            assert "is what is read: nothing replaces it; name another output" in said
+    assert read.read_bytes() == before
+    assert other.is_symlink()
+
+
 def test_a_relief_is_drawn_by_the_tracer(tmp_path: Path) -> None:
     relief = tmp_path / "print.exr"
     assert call("synth", "print", "-o", relief, "--as", "relief", "--size", 16) == 0
@@ -1023,6 +1062,10 @@ def test_a_relief_is_drawn_by_the_tracer(tmp_path: Path) -> None:
     (("--light", "nan,0"), 2, "expected finite angles"),
     (("--view", "1"), 2, "expected THETA,PHI"),
     (("--env", "none.hdr"), 1, "none.hdr: No such file"),
+    (("--sweep", "light", "--fps", "nan"), 2, "'nan' is not a finite number"),
+    (("--sweep", "light", "--fps", "inf"), 2, "'inf' is not a finite number"),
+    (("--sweep", "light", "--fps", "0"), 2, "0.0 is not in the range"),
+    (("--exposure", "nan"), 2, "'nan' is not a finite number"),
 ])  # fmt: skip
 def test_wrong_options_are_refused_before_a_file_appears(
     options: tuple[str, ...], code: int, message: str, store: Path, tmp_path: Path,

@@ -13,10 +13,13 @@ from cases import made
 from btfkit.btf import BTF
 from btfkit.cli import btfkit
 from btfkit.cli.outcome import run
+from btfkit.io import images
 from btfkit.io.images import read_exr
 from btfkit.io.store import reader, writer
 from btfkit.io.ubo2003 import write as write_ubo
+from btfkit.materials.base import Header
 from btfkit.materials.file import save
+from btfkit.materials.lambert import Lambert, LambertSpec
 from btfkit.relief.synth import synth_btf
 from btfkit.render import studio
 from btfkit.render.preview import Scene, render
@@ -70,6 +73,19 @@ def test_render_without_a_light_is_lit_by_the_studio_and_tells_so(
         assert run(btfkit, ["render", str(model), "-o", str(png), *size, *option]) == 0
         # 0.18 is 118 in sRGB.
         assert cv2.imread(str(png))[0, 0].tolist() == [grey] * 3
+
+
+@pytest.mark.parametrize("wrap", ["clamp", "wrap"])
+def test_a_sample_that_does_not_tile_shows_no_seam(wrap: str) -> None:
+    ramp = np.repeat(np.linspace(0.1, 0.9, 32, dtype=np.float32)[None, :, None], 32, axis=0)
+    texture = np.concatenate([ramp, ramp.transpose(1, 0, 2), 0 * ramp + 0.5], axis=-1)
+    material = Lambert(LambertSpec((32, 32)), {"texture": texture}, Header((32, 32), wrap=wrap))
+    drawn = images.read("p.png", studio.picture(material, size=96), transfer="srgb")
+    # Well inside the ball, where shading is smooth.
+    inner = drawn[30:66, 30:66]
+    jump = max(np.abs(np.diff(inner, axis=k)).max() for k in (0, 1))
+    # The ends of the ramp meet in the middle of the ball where it tiles.
+    assert jump < 0.08 if wrap == "clamp" else jump > 0.2
 
 
 def test_a_sheet_holds_the_four_corners_of_a_measurement() -> None:

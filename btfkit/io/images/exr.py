@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -240,10 +242,16 @@ def _pixels(name: str, source: Any, part: int, spec: Any, coded: int) -> Array:
     check_size(name, spec.height, spec.width, spec.nchannels, coded=coded)
     source.seek_subimage(part, 0)
     pixels = source.read_image(oiio.FLOAT)
-    fault = said(source.geterror)
+    fault = _said(source.geterror)
     if pixels is None or fault:
         raise FormatError(name, f"the EXR cannot be decoded ({fault})", remedy="copy it again")
     return _in_display_window(name, np.asarray(pixels, np.float32), spec, coded)
+
+
+def _said(ask: Callable[[], str]) -> str:
+    """What OpenImageIO says, of the file instead of the copy that it was given."""
+    copy = re.escape(os.path.join(tempfile.gettempdir(), tempfile.gettempprefix()))
+    return said(lambda: re.sub(rf"{copy}\w+(\.exr)?", "the file", ask()))
 
 
 def _with_exr(name: str, data: bytes, use: Callable[[Any], T]) -> T:
@@ -258,7 +266,7 @@ def _with_exr(name: str, data: bytes, use: Callable[[Any], T]) -> T:
         source = oiio.ImageInput.open(file.name)
         if source is None:
             raise FormatError(
-                name, f"the EXR cannot be opened ({said(oiio.geterror)})",
+                name, f"the EXR cannot be opened ({_said(oiio.geterror)})",
                 remedy="save it with whole, flat channels R, G and B",
             )  # fmt: skip
         try:

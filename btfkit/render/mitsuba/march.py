@@ -159,7 +159,7 @@ def _march(
     gap = above(start, active)
     _, low, high, under, gap, near, least, _ = dr.while_loop(
         (mi.Float(1), start, start, gap, gap, start, mi.Float(_FAR), mi.Bool(active)),
-        lambda *state: state[-1], look, max_iterations=most,
+        lambda *state: state[-1], look, max_iterations=most, mode="symbolic",
     )  # fmt: skip
     if again is not None:
         passes = active & again & (under > 0) & (least < _FAR)

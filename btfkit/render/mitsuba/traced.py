@@ -117,7 +117,8 @@ class Traced:
         way = [si.wi.x, si.wi.y, si.wi.z]
         bent = self._asked.curvature(si, active) if self._evaluation.bends else 0.0
         footprint = self._asked.footprint(si)
-        seen = self._evaluation.seen(uv, way, footprint, active, bent)
+        # Each takes what it has seen itself.
+        seen: Any = self._evaluation.seen(uv, way, footprint, active, bent)
         lobe = self._lobes(self._evaluation.place(seen), si.wi, footprint, active)
         # From behind there is nothing: what passed it leaves the body as it came.
         cover = mi.Float(1)
