@@ -127,7 +127,7 @@ def flat_drift(drift: ArrayLike, shape: tuple[int, ...]) -> Array:
             f"drift has leading shape {part.shape[:-1]}; the other parts have {shape}"
         ) from error
     flat = np.ascontiguousarray(every).reshape(-1, 4)
-    if len(flat) and -MOST_DRIFT <= flat.min() and flat.max() <= MOST_DRIFT:
+    if len(flat) and flat.min() >= -MOST_DRIFT and flat.max() <= MOST_DRIFT:
         return flat
     return np.clip(flat, -MOST_DRIFT, MOST_DRIFT)
 
