@@ -17,12 +17,16 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from btfkit import native
+
 Array = NDArray[np.float32]
 Floats = NDArray[Any]
 
 _ROUNDS, _STEPS, _TOLERANCE = 4, 300, 1e-6
 # A residual so many times the usual one counts half: a step of the surface, not noise.
 _HALF = 2.5
+# Texels from which on a transform gains by threads.
+_LARGE = 1 << 16
 # An equation never loses all its weight: the parts of a surface hang together by something.
 _LEAST = 1e-4
 
@@ -237,9 +241,12 @@ def _preconditioner(system: System) -> Any:
     values = mean[0] * lx + mean[1] * ly[:, None] + known
     inverse = np.where(values > 1e-12 * values.max(), 1 / np.maximum(values, 1e-300), 0)
 
+    threads = native.threads() if h * w >= _LARGE else 1
+
     def apply(residual: Floats) -> Floats:
-        if system.wrap:
-            return scipy.fft.irfft2(scipy.fft.rfft2(residual) * inverse, s=(h, w))
-        return scipy.fft.idctn(scipy.fft.dctn(residual, norm="ortho") * inverse, norm="ortho")
+        with scipy.fft.set_workers(threads):
+            if system.wrap:
+                return scipy.fft.irfft2(scipy.fft.rfft2(residual) * inverse, s=(h, w))
+            return scipy.fft.idctn(scipy.fft.dctn(residual, norm="ortho") * inverse, norm="ortho")
 
     return apply

@@ -15,7 +15,7 @@ from btfkit.cli.outcome import run
 from btfkit.errors import FitError
 from btfkit.fitting.heightfield import find_heights, find_relief
 from btfkit.fitting.heightfield.accuracy import against_truth, errors_of_heights, truth_of
-from btfkit.fitting.heightfield.alone import by_light, by_parallax
+from btfkit.fitting.heightfield.alone import by_light, by_parallax, surface
 from btfkit.fitting.heightfield.bounds import shadow_bounds
 from btfkit.fitting.heightfield.fusion import fuse
 from btfkit.fitting.heightfield.orientation import check_lights, check_shadows, check_views
@@ -149,7 +149,8 @@ def test_a_half_turn_of_everything_is_told_by_shadows() -> None:
     relief = procedural.make("cobbles", SIZE, relief_texels=2.5)
     btf = frontal(synth.relief_btf(relief, lights="14", views="1", samples=2))
     few = read_stack(btf)
-    check_shadows(few, photometric_stereo(few))
+    normals = photometric_stereo(few)
+    check_shadows(few, normals, surface(normals, wrap=few.wrap).height)
     around = replace(btf, light=btf.light * np.float32([-1, -1, 1]))
     with pytest.raises(FitError, match=r"should lie in shadow has .* of the light"):
         find_relief(around, holdout=0.0)

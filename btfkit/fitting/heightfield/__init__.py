@@ -17,18 +17,16 @@ from numpy.typing import NDArray
 from btfkit.btf import BTF, Wrap
 from btfkit.fitting.analytic import Maps, fit_maps
 from btfkit.fitting.heightfield import orientation
-from btfkit.fitting.heightfield.alone import SWEEPS, by_light
+from btfkit.fitting.heightfield.alone import SWEEPS, by_light, surface
 from btfkit.fitting.heightfield.bounds import Bounds, shadow_bounds
 from btfkit.fitting.heightfield.fusion import Fused, fuse
 from btfkit.fitting.heightfield.parallax import Sweep, disagreement, fitted_heights, sweep
 from btfkit.fitting.heightfield.units import as_reflectance
 from btfkit.heldout import split
-from btfkit.relief.integration import integrate
 from btfkit.relief.photometric import (
     Normals,
     check_lights,
     photometric_stereo,
-    slope_weights,
 )
 from btfkit.relief.relief import Relief
 from btfkit.relief.stack import Stack, read_stack, visibility
@@ -206,7 +204,7 @@ def find_heights(
     few, many = stack.for_normals(), stack.for_parallax()
     first = photometric_stereo(few)
     turn = orientation.check_lights(first, wrap=stack.wrap)
-    orientation.check_shadows(few, first)
+    orientation.check_shadows(few, first, surface(first, wrap=few.wrap).height)
     orientation.check_views(many, first)
     height = start
     if height is None:
@@ -242,8 +240,7 @@ def _no_parallax(btf: BTF, stack: Stack) -> str | None:
 def _is_flat(stack: Stack) -> bool:
     """Whether slopes say so too: structure that repeats hides its own movement."""
     normals = photometric_stereo(stack.for_normals())
-    height = integrate(normals.slope, slope_weights(normals), wrap=stack.wrap).height
-    return float(height.std()) < _FLAT_HEIGHT
+    return float(surface(normals, wrap=stack.wrap).height.std()) < _FLAT_HEIGHT
 
 
 def _from_normals(stack: Stack) -> Solved:
@@ -251,8 +248,9 @@ def _from_normals(stack: Stack) -> Solved:
     few = stack.for_normals()
     first = photometric_stereo(few)
     turn = orientation.check_lights(first, wrap=stack.wrap)
-    orientation.check_shadows(few, first)
-    normals, whole = by_light(few, first)
+    plain = surface(first, wrap=few.wrap)
+    orientation.check_shadows(few, first, plain.height)
+    normals, whole = by_light(few, (first, plain))
     nothing = np.full(stack.size, np.nan, np.float32)
     figures = {"integration_residual": whole.residual}
     return Solved(normals, {"normals": whole.height}, "normals", nothing, turn, figures)
@@ -283,7 +281,7 @@ def _in_rounds(
         done, longest = done + 1, max(longest, time.perf_counter() - now)
     assert found is not None
     normals, swept, fused, bounds = found
-    alone = integrate(normals.slope, slope_weights(normals), wrap=few.wrap).height
+    alone = surface(normals, wrap=few.wrap).height
     heights |= {"normals": alone + height.mean() - alone.mean(), "parallax": swept.height}
     heights["fusion"] = height
     figures = {

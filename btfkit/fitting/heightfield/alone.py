@@ -21,19 +21,29 @@ _CARVINGS = 12
 _SOFT = 0.5
 
 
-def by_light(stack: Stack, first: Normals | None = None) -> tuple[Normals, Integrated]:
+def surface(normals: Normals, *, wrap: bool) -> Integrated:
+    """The surface of normals by their slopes and how sure these are."""
+    return integrate(normals.slope, slope_weights(normals), wrap=wrap)
+
+
+def by_light(
+    stack: Stack, first: tuple[Normals, Integrated] | None = None
+) -> tuple[Normals, Integrated]:
     """Normals, and the surface of their slopes alone, with the relief's own shadows.
 
     Args:
         stack: many lights of a few views, each taken to see the plane.
-        first: normals found before, without shadows known; None finds them.
+        first: normals found before, without shadows known, and their surface; None finds them.
     """
-    normals = photometric_stereo(stack) if first is None else first
+    if first is None:
+        found = photometric_stereo(stack)
+        first = found, surface(found, wrap=stack.wrap)
+    normals, whole = first
     for _ in range(_NORMAL_ROUNDS):
-        whole = integrate(normals.slope, slope_weights(normals), wrap=stack.wrap)
         visible = visibility(whole.height, stack.lights, wrap=stack.wrap)[stack.light_of]
         normals = photometric_stereo(stack, visible=visible, start=normals)
-    return normals, integrate(normals.slope, slope_weights(normals), wrap=stack.wrap)
+        whole = surface(normals, wrap=stack.wrap)
+    return normals, whole
 
 
 def by_parallax(stack: Stack, height: Array) -> Array:

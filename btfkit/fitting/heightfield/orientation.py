@@ -10,7 +10,7 @@ from btfkit.errors import FitError
 from btfkit.fitting.heightfield.bounds import lit_share
 from btfkit.fitting.heightfield.parallax import disagreement
 from btfkit.relief.integration import curl, integrate
-from btfkit.relief.photometric import Normals, slope_weights
+from btfkit.relief.photometric import Normals
 from btfkit.relief.stack import Array, Stack, spread, visibility
 
 # Turned directions count as the truth where they lower the curl, or the disagreement, to this part.
@@ -66,11 +66,12 @@ def check_lights(normals: Normals, *, wrap: bool) -> float:
     return ours
 
 
-def check_shadows(stack: Stack, normals: Normals) -> None:
+def check_shadows(stack: Stack, normals: Normals, height: Array) -> None:
     """Refuse lights that are turned by half a circle, which makes hills of valleys, by shadows.
 
     Args:
         stack: many lights of a few views. normals: fitted to it, without shadows known.
+        height: (h, w) their surface, texels.
 
     Raises:
         FitError: where the relief should lie in shadow it is lit, turned around it is dark.
@@ -78,7 +79,6 @@ def check_shadows(stack: Stack, normals: Normals) -> None:
     low = np.flatnonzero(stack.lights[:, 2] > _LOWEST)
     low = low[np.argsort(stack.lights[low, 2])[:_LOW_LIGHTS]]
     few = stack.subset(np.isin(stack.light_of, low))
-    height = integrate(normals.slope, slope_weights(normals), wrap=stack.wrap).height
     share, facing = lit_share(few, np.zeros_like(height), normals)
     known = facing & np.isfinite(share)
     shares = []

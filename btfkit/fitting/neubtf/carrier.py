@@ -42,7 +42,7 @@ class Asked:
 
     Attributes:
         averaged: whether the guidance is a mean over many lights.
-        left_out: what of the sample must not be copied.
+        left_out: what of the sample must not be copied; nothing is copied to anywhere else.
         judged: whether errors are told by it: then a sample is not copied onto itself, which would
             hide an encoder that fails.
         slope: (h, w, 2) dz/dx and dz/dy that heights follow, y up, NaN where unknown.
@@ -168,14 +168,21 @@ class Carrier:
         copier = None if by is None else by._copier(material, answer, window)
         if by is not None and copier is not None and by.mix is not None:
             wanted = augment.resized(self.standardised(material)[None], size, wrap=wrap)[0]
-            among = self._shown(window, size, wrap=wrap) > 0.5
-            # What lies around the window is looked at, and not asked.
-            at, around, within = bounds(among, REACH)
-            found = in_parts(copier, by.scaled(answer[(..., *around)]), wrap=False, reach=REACH)
-            copied, own = found[(0, ..., *within)], answer[(0, ..., *at)]
+            among, at, copied = by._copied_there(copier, answer, window, wrap=wrap)
+            own = answer[(0, ..., *at)]
             mix = Mix.measured(own, copied, wanted[(..., *at)], among[at], by.mix.scale)
             answer[(0, ..., *at)], share = mix(own, copied)
         return self._made(material, answer, self.guidance, header, share), mix
+
+    def _copied_there(
+        self, copier: Copier, answer: Tensor, window: Window, *, wrap: bool
+    ) -> tuple[Tensor, tuple[slice, slice], Tensor]:
+        """(h, w) what lies in a window, its rows and columns, and what is copied to these."""
+        among = self._shown(window, (answer.shape[2], answer.shape[3]), wrap=wrap) > 0.5
+        # What lies around the window is looked at, and not asked.
+        at, around, within = bounds(among, REACH)
+        found = in_parts(copier, self.scaled(answer[(..., *around)]), wrap=False, reach=REACH)
+        return among, at, found[(0, ..., *within)]
 
     def of_part(self, part: Window) -> Carrier:
         """The same of a part of the sample."""
@@ -212,9 +219,14 @@ class Carrier:
         answer, share = self.answer(guidance, wrap=wrap, averaged=asked.averaged), 0.0
         copier = None if itself else self.copier(material, asked.left_out)
         if copier is not None and self.mix is not None:
-            found = in_parts(copier, self.scaled(answer), wrap=wrap, reach=REACH)
-            mixed, share = self.mix(answer[0], found[0])
-            answer = mixed[None]
+            if asked.left_out is None:
+                found = in_parts(copier, self.scaled(answer), wrap=wrap, reach=REACH)
+                mixed, share = self.mix(answer[0], found[0])
+                answer = mixed[None]
+            else:
+                # Of a sample that is judged nothing else is asked, and patches take long.
+                _, at, copied = self._copied_there(copier, answer, asked.left_out, wrap=wrap)
+                answer[(0, ..., *at)], share = self.mix(answer[(0, ..., *at)], copied)
         return self._made(material, answer, guidance, header, share, asked.slope)
 
     def _made(

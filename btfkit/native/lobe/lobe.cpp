@@ -13,7 +13,11 @@
 
 // Clang reads the list otherwise, and some come without what chooses at run time.
 #if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GNUC__) && !defined(__clang__)
+#if __GNUC__ >= 12
+#define CLONES __attribute__((target_clones("default", "avx2,fma", "arch=x86-64-v4")))
+#else
 #define CLONES __attribute__((target_clones("default", "avx2,fma")))
+#endif
 #else
 #define CLONES
 #endif
