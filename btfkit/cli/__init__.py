@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
 import click
+
+# numpy reads it when it is loaded. OpenBLAS's threads spin at barriers: with both cores taken,
+# products of small matrices ran 5 to 160 times slower on two of them than on one. Kernels and
+# torch, which do the large work, have threads of their own.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Verb -> module with a function of the verb's name, and the line that `btfkit --help` shows.
 VERBS: dict[str, tuple[str, str]] = {

@@ -528,6 +528,20 @@ def test_threads_sleep_at_barriers_from_python_too(given: str | None) -> None:
     assert done.stdout.strip() == (given or "PASSIVE")
 
 
+@pytest.mark.parametrize("given", [None, "3"])
+def test_the_command_leaves_numpy_one_thread_unless_told(given: str | None) -> None:
+    environment = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    environment |= {"OPENBLAS_NUM_THREADS": given} if given else {}
+    code = (
+        "import os, sys, btfkit.cli; assert 'numpy' not in sys.modules; "
+        "print(os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == (given or "1")
+
+
 def test_reports_and_materials_say_themselves_in_a_line() -> None:
     report = btfkit.fit(sample(), model="lambert")
     for value in (report, report.material, sample()):
