@@ -99,8 +99,8 @@ class Axis:
             )
         if direction.shape != (3,) or not np.isfinite(length) or length < 1e-9:
             raise CalibrationError(
-                f"axis {self.name!r} has direction {direction.tolist()}; expected three numbers, "
-                "not all zero"
+                f"axis {self.name!r} has no direction: {direction.tolist()}; expected three "
+                "numbers, not all zero, and their length a number"
             )
         object.__setattr__(self, "direction", direction / length)
         object.__setattr__(self, "point_mm", np.asarray(self.point_mm, float))

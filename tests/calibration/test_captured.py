@@ -110,7 +110,7 @@ def test_a_window_merges_only_the_pixels_that_it_needs(run, monkeypatch):
         (lambda d: d.pop("rig"), r"has no rig.axes, and 4 sample frames have no light_x.*describe rig.axes"),
         (lambda d: d["rig"]["camera"].pop("focal_px"), r"focal_px.*add axes"),
         (lambda d: d["rig"].update(light={}), r"rig of sequence.json does not tell where camera and light are"),
-        (lambda d: d["rig"]["axes"][0].update(direction=[0, 0, 0]), r"axis 'ring' has direction \[0.0, 0.0, 0.0\]; expected three numbers"),
+        (lambda d: d["rig"]["axes"][0].update(direction=[0, 0, 0]), r"axis 'ring' has no direction: \[0.0, 0.0, 0.0\]; expected three numbers"),
         (lambda d: d["rig"]["axes"][0].update(name="other"), r"axes \['ring'\] carry the camera and are not in .*add axes"),
         (lambda d: d["sensor"].pop("gain_e_per_dn"), r"gain_e_per_dn.*flat"),
         (lambda d: d["target"].update(board={"squares": [9, 7], "square_mm": 4, "marker_mm": 3, "x": [1, 0, 0], "y": [1, 0, 0]}),
