@@ -296,6 +296,9 @@ def test_groups_4_and_6_any_curvature_and_depth_give_numbers(depth, z):
     with np.errstate(all="raise", under="ignore"):
         found = bent.meet(heights, uv, view, curvature, aspect=1.0, wrap=True)
     assert np.isfinite(found.depth).all()
+    # Torch does not multiply numbers of two widths.
+    for part in (found.depth, found.opacity, found.way, found.turn):
+        assert part.dtype == np.float32
     assert set(np.unique(found.opacity)) <= {0.0, 1.0}
     concave = (curvature <= 0) & (z > 0)
     assert found.opacity[concave].all()

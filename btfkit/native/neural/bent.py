@@ -149,7 +149,7 @@ def meet(
     length = rays.stop - rays.start
     texels = length * np.max(np.abs(rays.along) * [w, h], axis=1)
     texels = texels * np.where(sure, 1, CURVED_FINER)
-    count = np.clip(np.ceil(texels), 1, np.where(sure, LOOKS, found.looks))
+    count = np.clip(np.ceil(texels), 1, np.where(sure, LOOKS, found.looks)).astype(length.dtype)
     low = high = rays.start
     under = gap = above(low)
     going = np.ones(len(uv), bool)
