@@ -4,8 +4,9 @@
 
 meshes      IoU on three irregular closed meshes and under uv stretched 1:2 and 1:4, of what is
             solid, of known heights, of these by the curvature of the entry along the ray, by its
-            mean curvature (the paper's Fig. 7), and without correction of scale (Fig. 6). Truth is
-            the mesh displaced a quarter of a texel apart.
+            mean curvature (the paper's Fig. 7), by the least along a short curve past the entry
+            (its filter, Fig. 2 b), and without correction of scale (Fig. 6). Truth is the mesh
+            displaced a quarter of a texel apart.
 radii       IoU in the band of cylinders of a radius of 2 to 20 thicknesses, known heights.
 footprints  error of opacity against the tracer's by level of detail, sharp and soft.
 frames      a torus in a moving view, four rays a pixel: how its cover changes from frame to frame
@@ -50,6 +51,7 @@ from btfkit.shapes.bending import principal, vertex_forms, vertices
 from btfkit.shapes.closed import Floats, Meeting, Shape, Surface
 from btfkit.shapes.embree import rays_to
 from btfkit.shapes.mesh import Mesh
+from btfkit.shapes.minimum import MinimumCurvature
 from btfkit.shapes.swept import CLOSED, mesh
 from btfkit.shapes.torus import Torus
 from btfkit.shapes.triangles import Triangles
@@ -63,6 +65,8 @@ BEND = 0.8
 SURFACES = (
     ("dented", (3, 1)), ("knot", (9, 1)), ("pear", (2, 1)), ("dented", (3, 2)), ("dented", (3, 4)),
 )  # fmt: skip
+# Of the paper's filter, which leaves it open: lengths of its curve, tile widths.
+REACHES = (0.05, 0.1, 0.2, 0.4)
 Rows = Iterator[dict[str, Any]]
 
 
@@ -138,6 +142,10 @@ def meshes() -> Rows:
             "entry": (entry, shape),
             "mean curvature": (entry, Told(shape, _mean)),
             "scale halved": (entry, Told(shape, lambda bend: bend / 2)),
+            **{
+                f"minimum over {reach}": (entry, MinimumCurvature(shape, reach))
+                for reach in REACHES
+            },
         }
         yield {
             "material": name,

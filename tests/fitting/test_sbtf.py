@@ -111,6 +111,45 @@ def test_on_the_plane_an_sbtf_is_the_neumip_of_its_arrays() -> None:
         np.testing.assert_array_equal(found, wanted)
 
 
+def test_what_stands_above_the_plane_is_moved_under_it() -> None:
+    top = 0.06
+    high = random_sbtf(relief().height - relief().height.min() + np.float32(top / 2))
+    low, shift = high.under_surface()
+    top = -shift
+    heights = low.layout.surface(low.texels)
+    assert heights.max() == 0
+    assert top == pytest.approx(-float(relief().height.min()) + 0.03, abs=1e-3)
+    query = on_cylinders(2000)
+    # Above the plane everything stops a ray; under it outlines are those of the relief.
+    assert high.evaluate(*query).opacity.all()
+    known = random_sbtf(relief().height).evaluate(*query).opacity
+    # Half floats of shifted heights: 1e-4 tile widths, by which few rays are decided.
+    assert metrics.iou(low.evaluate(*query).opacity, known) > 0.98
+    assert known.mean() < 0.9
+    # On the plane one ray sees one place: at uv of the new plane what lay at the old one's.
+    steep = query.view[:, 2] > 0.5
+    uv, light, view = query.uv[steep], query.light[steep], query.view[steep]
+    moved = uv + top * view[:, :2] / view[:, 2:] * [-1, 1]
+    old = high.evaluate(moved, light, view).reflectance
+    new = low.evaluate(uv, light, view).reflectance
+    off = np.abs(new - old).max(axis=1)
+    spread = np.abs(old - old.mean(axis=0)).mean()
+    assert np.quantile(off, 0.9) < 0.1 * spread
+    assert np.abs(high.evaluate(uv, light, view).reflectance - new).mean() > 0.3 * spread
+
+
+@pytest.mark.slow
+def test_a_report_says_what_stands_above_the_plane() -> None:
+    from btfkit.relief.synth import relief_btf
+
+    raised = replace(relief(), height=relief().height + np.float32(0.2))
+    settings = {"levels": 1, "batch": 512}
+    for each, said in ((raised, True), (relief(), False)):
+        data = relief_btf(each, views="19", lights="9", samples=1)
+        report = fit(data, model="sbtf", steps=50, settings=settings)
+        assert ("under_surface()" in report.untrained[0]) == said
+
+
 def test_a_query_file_with_curvature_is_fitted_and_evaluated_by_auto(tmp_path) -> None:
     queries = queries_of(relief(), seed=5).subset(slice(4000))
     report = fit(queries, steps=20, settings={"batch": 512}, out=tmp_path / "a.safetensors")

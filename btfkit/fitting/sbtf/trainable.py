@@ -31,6 +31,8 @@ from btfkit.relief.relief import Relief
 
 # Steps between looks at outlines, and rows of a look; steps between looks at the thickness.
 _OUTLINE_STEPS, _OUTLINE_ROWS, _THICKNESS_STEPS = 4, 2048, 100
+# Share of their range that heights may stand above a BTF's plane, unsaid.
+_LITTLE = 0.05
 
 
 @final
@@ -167,7 +169,21 @@ class SBTF(Marching[Settings]):
         heights = given if self._given is not None else "the parallax of its views"
         return (
             "curved surfaces: nothing was measured there; outlines and displaced places are those "
-            f"of heights from {heights}, colours those of the plane where a ray ends",
+            f"of heights from {heights}, colours those of the plane where a ray ends"
+            + self._above(),
+        )
+
+    def _above(self) -> str:
+        """What is said of heights above the plane of a BTF."""
+        if not isinstance(self._data, BTF):
+            return ""
+        found = self.layout.surface(self.engine.parameters()[1]) * self.spec.depth_scale
+        low, high = float(found.min()), float(found.max())
+        if high <= _LITTLE * (high - low):
+            return ""
+        return (
+            f"; heights lie {low:.3g} to {high:.3g} tile widths from the plane of the pictures, "
+            "and stop all rays where they are above it: SBTF.under_surface() moves them under it"
         )
 
     @property

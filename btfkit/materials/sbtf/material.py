@@ -62,6 +62,18 @@ class SBTF(NeuMIPMaterial):
         self.thickness = max(-float(found.heights.min()), 0.0) * found.scale
         self.sharpest = bent.sharpest(found)
 
+    def under_surface(self) -> tuple[SBTF, float]:
+        """The same with its highest point at 0, for a bounding surface, and what was added.
+
+        Rays on curved surfaces begin at 0, so what a measured sample has above the plane of its
+        pictures stops them all. On the plane the places that are seen move with the heights: what
+        was measured at uv is answered where its ray crosses the new plane.
+        """
+        heights = np.asarray(self._depth.heights, np.float32)
+        top = heights.max()
+        weights = {**self.weights, "texture.heights": (heights - top)[..., None]}
+        return SBTF(self.spec, weights, self.header), -float(top) * self._depth.scale
+
     def _answer(self, query: Query) -> tuple[Array, Array | None]:
         rows = self._may_pass(query)
         return softened(query, None, rows, self.header.grid, self._answer_sharp)
