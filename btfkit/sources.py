@@ -97,7 +97,8 @@ def material(path: Location, *, curved: bool = False) -> Material:
 
     Args:
         path: of the model, BTF or relief.
-        curved: whether it will lie on a shape, of which a relief must not jut out.
+        curved: whether it will lie on a shape, of which a relief, and the relief of a model with
+            outlines, must not jut out.
 
     Raises:
         FileNotFoundError, FormatError: as `read`; queries are refused too.
@@ -107,7 +108,7 @@ def material(path: Location, *, curved: bool = False) -> Material:
 
     found = read(path)
     if isinstance(found, Material):
-        return found
+        return _under_surface(found) if curved else found
     if isinstance(found, BTF):
         from btfkit.materials.measured.interpolation import Interpolation
 
@@ -118,6 +119,14 @@ def material(path: Location, *, curved: bool = False) -> Material:
         return TracedRelief(found.under_surface()[0] if curved else found)
     expected = _listed("model", "btf", "relief")
     raise FormatError(str(path), f"is {_NAMES['queries']}; expected {expected}")
+
+
+def _under_surface(model: Material) -> Material:
+    from btfkit.materials.sbtf.material import SBTF
+
+    if isinstance(model, SBTF) and model.stands_above:
+        return model.under_surface()[0]
+    return model
 
 
 def _listed(*kinds: Kind) -> str:

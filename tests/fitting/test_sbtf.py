@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 from sbtfs import random_sbtf
 
 import btfkit
-from btfkit import metrics
+from btfkit import metrics, sources
 from btfkit.errors import FitError
 from btfkit.fitting.fit import fit
 from btfkit.fitting.sbtf import tracing
 from btfkit.fitting.sbtf.holes import opacity_of, thickness_of
 from btfkit.fitting.sbtf.outlines import carved, moved
 from btfkit.fitting.sbtf.tracing import queries_of
+from btfkit.materials import file
 from btfkit.materials.base import Material
 from btfkit.materials.neumip.material import NeuMIP
 from btfkit.materials.sbtf.material import SBTF
@@ -111,7 +113,7 @@ def test_on_the_plane_an_sbtf_is_the_neumip_of_its_arrays() -> None:
         np.testing.assert_array_equal(found, wanted)
 
 
-def test_what_stands_above_the_plane_is_moved_under_it() -> None:
+def test_what_stands_above_the_plane_is_moved_under_it(tmp_path: Path) -> None:
     top = 0.06
     high = random_sbtf(relief().height - relief().height.min() + np.float32(top / 2))
     low, shift = high.under_surface()
@@ -126,6 +128,13 @@ def test_what_stands_above_the_plane_is_moved_under_it() -> None:
     # Half floats of shifted heights: 1e-4 tile widths, by which few rays are decided.
     assert metrics.iou(low.evaluate(*query).opacity, known) > 0.98
     assert known.mean() < 0.9
+    # A shape that is drawn gets it so; the plane as it is.
+    for model, jutting in ((high, True), (low, False)):
+        file.save(model, tmp_path / "a.safetensors", force=True)
+        drawn = sources.material(tmp_path / "a.safetensors", curved=True).evaluate(*query)
+        flat = sources.material(tmp_path / "a.safetensors").evaluate(*query)
+        np.testing.assert_array_equal(drawn.opacity, low.evaluate(*query).opacity)
+        assert np.array_equal(drawn.opacity, flat.opacity) != jutting
     # On the plane one ray sees one place: at uv of the new plane what lay at the old one's.
     steep = query.view[:, 2] > 0.5
     uv, light, view = query.uv[steep], query.light[steep], query.view[steep]

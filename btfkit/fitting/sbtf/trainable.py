@@ -31,8 +31,6 @@ from btfkit.relief.relief import Relief
 
 # Steps between looks at outlines, and rows of a look; steps between looks at the thickness.
 _OUTLINE_STEPS, _OUTLINE_ROWS, _THICKNESS_STEPS = 4, 2048, 100
-# Share of their range that heights may stand above a BTF's plane, unsaid.
-_LITTLE = 0.05
 
 
 @final
@@ -178,12 +176,12 @@ class SBTF(Marching[Settings]):
         if not isinstance(self._data, BTF):
             return ""
         found = self.layout.surface(self.engine.parameters()[1]) * self.spec.depth_scale
-        low, high = float(found.min()), float(found.max())
-        if high <= _LITTLE * (high - low):
+        if not sbtf.stands_above(found):
             return ""
         return (
-            f"; heights lie {low:.3g} to {high:.3g} tile widths from the plane of the pictures, "
-            "and stop all rays where they are above it: SBTF.under_surface() moves them under it"
+            f"; heights lie {found.min():.3g} to {found.max():.3g} tile widths from the plane of "
+            "the pictures, and stop all rays where they are above it: render moves them under it "
+            "on shapes, SBTF.under_surface() in Python"
         )
 
     @property

@@ -30,6 +30,16 @@ from btfkit.queries import Query
 _SHARP = 0.5001
 
 
+# Part of its heights' range that a model may stand above the plane with little of its outline lost.
+_LITTLE = 0.05
+
+
+def stands_above(heights: Array) -> bool:
+    """Whether heights (h, w) stand above the plane by more than a little, which stops all rays."""
+    low, high = float(heights.min()), float(heights.max())
+    return high > _LITTLE * (high - low)
+
+
 @final
 class SBTF(NeuMIPMaterial):
     """NeuMIP with silhouettes, on planes and under curved surfaces.
@@ -61,6 +71,11 @@ class SBTF(NeuMIPMaterial):
         self._depth = found
         self.thickness = max(-float(found.heights.min()), 0.0) * found.scale
         self.sharpest = bent.sharpest(found)
+
+    @property
+    def stands_above(self) -> bool:
+        """Whether its heights do; then `under_surface` is what shows outlines."""
+        return stands_above(self._depth.heights)
 
     def under_surface(self) -> tuple[SBTF, float]:
         """The same with its highest point at 0, for a bounding surface, and what was added.
