@@ -38,8 +38,11 @@ State = dict[str, Any]
 _LOOKS, _LOOKING = 12, 0.1
 _SAVE_EVERY_S = 60.0
 _ROLLBACKS = 3
-# A loss this many times the recent median is a divergence, not a hard batch.
+# A loss this many times the recent median, and above what losses were at first, is a divergence,
+# not a hard batch: a few texels at a border may be all that is left of the error.
 _DIVERGED = 50.0
+# So many losses tell what is usual.
+_TOLD = 17
 
 
 class Trainable(ABC):
@@ -251,14 +254,18 @@ class _Keeper:
         self._trainable, self._run, self._generators = trainable, run, generators
         self._file = state_file
         self._losses: deque[float] = deque(maxlen=64)
+        self._at_first: float | None = None
         self._snapshot = trainable.state()
         self._best = best
         self._next_look = (math.floor(run.progress() * _LOOKS) + 1) / _LOOKS
         self._saved_at = time.monotonic()
 
     def after_step(self, loss: float) -> None:
-        recent = float(np.median(self._losses)) if len(self._losses) > 16 else math.inf
-        if not math.isfinite(loss) or loss > _DIVERGED * max(recent, 1e-6):
+        recent = float(np.median(self._losses)) if len(self._losses) >= _TOLD else math.inf
+        if self._at_first is None and len(self._losses) >= _TOLD:
+            self._at_first = recent
+        limit = max(_DIVERGED * max(recent, 1e-6), self._at_first or 0.0)
+        if not math.isfinite(loss) or loss > limit:
             self._roll_back(loss)
             return
         self._losses.append(loss)

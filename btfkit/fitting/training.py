@@ -28,9 +28,11 @@ from btfkit.queries import QuerySet
 from btfkit.relief.relief import Relief
 
 if TYPE_CHECKING:
-    from btfkit.fitting.loop import Trainable
+    from btfkit.fitting.loop import Run, Trainable
 
 Progress = Callable[[int, int], None]
+# Of a budget, what a fit may have spent that was cut in its last step.
+_SPENT = 1.5
 
 
 @final
@@ -183,6 +185,8 @@ def trained(
     phases.begin("training")
     if plan.steps is None:
         run.budget_s = phases.training_s()
+    if plan.resume:
+        _check_left(run)
     try:
         loop.train(
             trainable, run, generators=generators, state_file=state, progress=progress, best=best
@@ -197,6 +201,23 @@ def trained(
         trainable.stated(),
     )  # fmt: skip
     return trainable.material(), ran
+
+
+def _check_left(run: Run) -> None:
+    """Refuse to go on with less than was spent, which would end the fit where it was cut.
+
+    One that was killed at its very end has spent all, or a step more, and is finished.
+    """
+    if run.steps is not None and run.done > run.steps:
+        spent, given = f"{run.done} steps", f"{run.steps}"
+    elif run.budget_s is not None and run.elapsed_s > _SPENT * run.budget_s:
+        spent, given = f"{run.elapsed_s:.1f} s of training", f"{run.budget_s:.1f}"
+    else:
+        return
+    raise FitError(
+        f"the state that is resumed has had {spent}, and {given} are left by what is given now",
+        remedy="give more than were spent (--budget, --steps); the state is as it was",
+    )
 
 
 def shared(environment: Mapping[str, str] = os.environ) -> bool:

@@ -266,11 +266,34 @@ def test_a_resumed_fit_takes_the_same_trajectory(
     assert part.is_file()
     assert report.steps == 17
     monkeypatch.setattr(neubtf.NeuBTFPaper, "step", original)
+    for less in ({"steps": 12}, {"budget_s": 1e-3}):
+        with pytest.raises(
+            FitError, match=r"resumed has had 17 steps, and 12|resumed has had .* s"
+        ):
+            fit.fit(tiny, model="neubtf-paper", out=part, settings=TINY, resume=True, **less)
     report = fit.fit(tiny, model="neubtf-paper", steps=30, out=part, settings=TINY, resume=True)
     assert (report.steps, report.interrupted) == (30, False)
     for name, array in btfkit.load(whole).weights.items():
         np.testing.assert_array_equal(array, btfkit.load(part).weights[name])
     assert not (tmp_path / "part.safetensors.state").exists()
+
+
+def test_a_hard_batch_among_easy_ones_is_no_divergence(
+    tiny: BTF, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is left of the error may be a few texels: then most batches have next to none."""
+    original, back = neubtf.NeuBTFPaper.step, []
+    losses = iter([1e-3] * 20 + [1e-6] * 70 + [5e-4] + [1e-6] * 20 + [0.1] + [1e-6] * 20)
+
+    def step(self: Any, progress: float) -> float:
+        original(self, progress)
+        return next(losses)
+
+    keeper = loop._Keeper
+    monkeypatch.setattr(keeper, "_roll_back", lambda self, loss: back.append(loss))
+    monkeypatch.setattr(neubtf.NeuBTFPaper, "step", step)
+    fit.fit(tiny, model="neubtf-paper", steps=120, settings=TINY)
+    assert back == [0.1]
 
 
 def _interrupted_after(step: Any, count: int) -> Any:
