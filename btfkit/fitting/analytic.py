@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from btfkit.btf import BTF, RGB, Wrap
 from btfkit.native.lobe import Lobes, Start, better, fit_lobes, shaded
-from btfkit.relief.photometric import Normals, normal_of, rank_window
+from btfkit.relief.photometric import normal_of, rank_window
 from btfkit.relief.relief import Relief
 from btfkit.relief.stack import Stack, read_stack, visibility
 
@@ -91,7 +91,6 @@ def fit_maps(
     normals: Array | None = None,
     heights: Array | None = None,
     stack: Stack | None = None,
-    start: Normals | None = None,
     seen: tuple[Mask, Mask] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Maps:
@@ -103,8 +102,6 @@ def fit_maps(
         heights: (h, w) tile widths: where each view sees a texel's point, and what the relief
             itself hides from light and view; None is flat.
         stack: the BTF's values where they were read before; None reads them.
-        start: lobes found before, which each fit begins with; None begins twice, with a narrow
-            lobe and a wide one.
         seen: of `stack` and `heights`, where the relief hides neither: (lights, h, w) of
             `stack.lights` and (views, h, w) of `stack.views`; None asks the relief.
         progress: called with (rows done, rows).
@@ -131,8 +128,7 @@ def fit_maps(
     for first in range(0, h, step):
         rows = slice(first, min(first + step, h))
         given = None if normals is None else slope_of(normals[rows].reshape(-1, 3))
-        begin = None if start is None else start.lobes(rows)
-        parts.append(_rows(values, flat, reached, given, begin, rows))
+        parts.append(_rows(values, flat, reached, given, rows))
         if progress:
             progress(rows.stop, h)
     lobes = Lobes(*(np.concatenate([part[0][k] for part in parts]) for k in range(7)))
@@ -157,7 +153,6 @@ def _rows(
     height: Array,
     seen: Mask | None,
     given: Array | None,
-    begin: Start | None,
     rows: slice,
 ) -> tuple[Lobes, Array, Array]:
     values = stack.seen(stack.values, height, rows)
@@ -168,7 +163,7 @@ def _rows(
     place = stack.place(height, rows)
     with np.errstate(invalid="ignore"):
         grey: Array = values @ np.full(values.shape[2], 1 / values.shape[2], np.float32)
-    starts = _starts(stack, grey, weight, place) if begin is None else [begin]
+    starts = _starts(stack, grey, weight, place)
     if given is not None:
         starts = [start._replace(slope=given) for start in starts]
     lobes = _fitted(stack, values, weight, place, starts, given is None)

@@ -116,8 +116,8 @@ def find_relief(
     )
     shape = bare(height, wrap=btf.wrap)
     maps = fit_maps(
-        btf, normals=shape.normals(), heights=shape.height, stack=stack,
-        start=solved.normals, seen=(lit, seen), progress=progress,
+        btf, normals=shape.normals(), heights=shape.height, stack=stack, seen=(lit, seen),
+        progress=progress,
     )  # fmt: skip
     relief = maps.relief(
         shape.height, wrap=btf.wrap, texel_mm=btf.texel_mm, channels=btf.channels,
