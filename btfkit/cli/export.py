@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import warnings
 from pathlib import Path
 
 import click
@@ -27,6 +28,12 @@ def export_verb(bar: Bar, *, model: Path, target: str, out: Path, force: bool) -
 
     refuse_existing(out, force=force, folder=True)
     made = export(load(model), target, out, force=force)
+    if made["wrap"] == "clamp":
+        warnings.warn(
+            f"{model} does not tile: beyond uv 0 to 1 its border texels repeat; "
+            "`btfkit tile` makes a tile of its BTF before the fit, or of a NeuBTF model",
+            stacklevel=2,
+        )
     listing = "\n".join(f"  {size:>10,}  {name}" for name, size in made["files"].items())
     return Outcome(
         f"{out}: {made['bytes']:,} bytes\n{listing}", {"out": out, **made}, then=_next(target, out)

@@ -7,23 +7,25 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from btfkit.export.ball import tiles_around
 from btfkit.export.sections import filled, whole_text
 from btfkit.materials.base import Material
 from btfkit.materials.file import save
 from btfkit.program import Program
 from btfkit.shapes.bending import vertex_curvature
 
-# Vertices of the ball around and from pole to pole, and tiles around it.
-_AROUND, _DOWN, _TILES = 128, 64, 4
+# Vertices of the ball around and from pole to pole.
+_AROUND, _DOWN = 128, 64
 _FLOOR = 5.0
 
 
 def write(material: Material, program: Program, folder: Path) -> None:
     """`material.safetensors`, `scene.xml`, `ball.ply`, `floor.ply` and `render.py`."""
     save(material, folder / "material.safetensors", lobes=True)
-    tile = 2 * np.pi / _TILES
-    for name, mesh in (("ball", _ball(material.header.aspect)),
-                       ("floor", _floor(tile, material.header.aspect))):  # fmt: skip
+    aspect, tiles = material.header.aspect, tiles_around(program)
+    # What does not tile covers the floor once.
+    tile = 2 * np.pi / tiles if program.wrap else 2 * _FLOOR * max(1, aspect)
+    for name, mesh in (("ball", _ball(aspect, tiles)), ("floor", _floor(tile, aspect))):
         write_ply(folder / f"{name}.ply", *mesh)
     # Light that passes a null lobe is only seen by the integrator of volumes.
     integrator = "path" if program.opacity == "none" else "volpath"
@@ -35,22 +37,22 @@ def write(material: Material, program: Program, folder: Path) -> None:
 Mesh = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.intp]]
 
 
-def _ball(aspect: float) -> Mesh:
-    """Positions, normals, uv and faces of the unit sphere, poles on z."""
+def _ball(aspect: float, tiles: float) -> Mesh:
+    """Positions, normals, uv and faces of the unit sphere, poles on z, `tiles` around it."""
     u, v = np.meshgrid(np.linspace(0, 1, _AROUND + 1), np.linspace(0, 1, _DOWN + 1))
     theta, phi = np.pi * (1 - v), 2 * np.pi * u
     at = np.stack(
         [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1
     ).reshape(-1, 3)
-    uv = np.stack([_TILES * u, _TILES / 2 * aspect * v], axis=-1).reshape(-1, 2)
+    uv = np.stack([tiles * u, tiles / 2 * aspect * v], axis=-1).reshape(-1, 2)
     return at, at.copy(), uv, _grid(_DOWN, _AROUND)
 
 
 def _floor(tile: float, aspect: float) -> Mesh:
-    """The same of a square below it, tiles of the same size."""
+    """The same of a square below it, tiles `tile` wide."""
     x, y = np.meshgrid([-_FLOOR, _FLOOR], [-_FLOOR, _FLOOR])
     at = np.stack([x, y, np.full((2, 2), -1.0)], axis=-1).reshape(-1, 3)
-    uv = np.stack([x / tile, y / tile * aspect], axis=-1).reshape(-1, 2)
+    uv = np.stack([(x + _FLOOR) / tile, (y + _FLOOR) / tile * aspect], axis=-1).reshape(-1, 2)
     return at, np.tile([0.0, 0.0, 1.0], (4, 1)), uv, _grid(1, 1)
 
 

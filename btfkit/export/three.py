@@ -10,6 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from btfkit.export.ball import tiles_around
 from btfkit.export.glsl import drawable, rgb
 from btfkit.export.glsl.atlas import atlas, quantised
 from btfkit.export.sections import filled, sections
@@ -28,6 +29,8 @@ def write(material: Material, program: Program, folder: Path) -> None:
     near = shaded(quantised(program, "half"), "wgsl", model=material.model, in_textures=True)
     starts = [start for name in atlas(program, "half").places for start in near.starts[name]]
     h, w = program.grid
+    around = tiles_around(program)
+    down = around / 2 * program.aspect
     parts: dict[str, Any] = {}
     at = 0
     held = made.data | {"numbers": near.buffers.get("weights", b"")}
@@ -40,6 +43,8 @@ def write(material: Material, program: Program, folder: Path) -> None:
         "channels": list(program.channels),
         "grid": [w, h],
         "aspect": program.aspect,
+        # Tiles around the ball of the page, and from pole to pole.
+        "ball": [around, max(1, round(down)) if program.wrap else down],
         "tile_mm": None if texel is None else [w * texel, h * texel],
         "textures": made.about,
         "parts": parts,

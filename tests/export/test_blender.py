@@ -97,6 +97,45 @@ def test_without_bpy_there_is_a_program_for_ones_own_blender(
     assert described["loss"]["view_dependent"]["psnr"] > 30
 
 
+def stood_in(folder: Path, *, broken: bool = False) -> dict[str, str]:
+    """What a Python needs to run `make_blend.py` with a bpy that does nothing, or none."""
+    (folder / "bpy.py").write_text(
+        "raise ModuleNotFoundError(\"No module named 'bpy'\")" if broken else ""
+    )
+    (folder / "mathutils.py").write_text("Vector = None")
+    return {**os.environ, "PYTHONPATH": str(folder)}
+
+
+@pytest.mark.parametrize(("name", "tiles"), [("lambert", 2), ("neumip-clamped", 1)])
+def test_sheets_of_what_does_not_tile_are_one_tile_wide(
+    name: str, tiles: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(blender.PYTHON, "false")
+    export(made(name), "blender", tmp_path / "out")
+    done = subprocess.run(
+        [sys.executable, "-c", "import make_blend; print(make_blend.TILES)"],
+        cwd=tmp_path / "out", env=stood_in(tmp_path), check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    assert int(done.stdout) == tiles
+
+
+@pytest.mark.parametrize("name", ["make_blend.py", "check.py"])
+def test_programs_say_in_one_line_how_they_get_bpy(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(blender.PYTHON, "false")
+    export(made("lambert"), "blender", tmp_path / "out")
+    environment = stood_in(tmp_path, broken=True)
+    done = subprocess.run(
+        [sys.executable, tmp_path / "out" / name],
+        env=environment, check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert f"blender -b -P {name}" in line
+    assert "pip install bpy" in line
+
+
 def test_networks_that_osl_cannot_hold_are_refused(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match=r"networks of \d+ weights; OSL takes at most 12000"):
         osl.written(made("rainer20").program())

@@ -384,6 +384,40 @@ def test_the_verb_writes_a_folder_and_replaces_none_unasked(
     assert not (out / "mine").exists()
 
 
+@pytest.mark.parametrize("grid", [(24, 36), (40, 12), (12, 40)])
+@pytest.mark.parametrize("wrap", ["wrap", "clamp"])
+def test_examples_leave_the_tile_only_where_it_tiles(
+    wrap: Any, grid: tuple[int, int], tmp_path: Path
+) -> None:
+    header = Header(grid=grid, wrap=wrap)
+    flat = Lambert(LambertSpec((9, 14)), {"texture": np.full((9, 14, 3), 0.5, "f4")}, header)
+    export(flat, "three", tmp_path / "three")
+    around, down = json.loads((tmp_path / "three" / "material.json").read_text())["ball"]
+    if wrap == "clamp":
+        assert max(around, down) == 1
+        assert down / around == pytest.approx(grid[1] / grid[0] / 2)
+    else:
+        assert min(around, down) >= 1
+    export(flat, "mitsuba", tmp_path / "mitsuba")
+    for name in ("ball", "floor"):
+        _, _, data = (tmp_path / "mitsuba" / f"{name}.ply").read_bytes().partition(b"end_header\n")
+        count = 129 * 65 if name == "ball" else 4
+        uv = np.frombuffer(data, "<f4", 11 * count).reshape(-1, 11)[:, 6:8]
+        assert uv.min() == 0
+        assert (uv.max() == 1) == (wrap == "clamp")
+
+
+def test_the_verb_warns_of_what_does_not_tile(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, count in (("lambert", 0), ("neumip-clamped", 1)):
+        model = tmp_path / f"{name}.safetensors"
+        save(made(name), model)
+        assert run(btfkit, ["export", str(model), "--to", "npz", "-o", str(tmp_path / name)]) == 0
+        said = capsys.readouterr().err
+        assert said.count("does not tile") == said.count("`btfkit tile`") == count
+
+
 def test_the_lobes_of_an_export_draw_as_the_material(tmp_path: Path) -> None:
     material, rng, n = made("neumip"), np.random.default_rng(7), 400
     export(material, "npz", tmp_path / "out")

@@ -54,7 +54,7 @@ def bent_of(made: Triangles):
 
 @pytest.mark.parametrize("radius", [0.5, 3.0])
 def test_a_ball_bends_by_the_width_of_its_tile_over_its_radius(radius: float) -> None:
-    at, normal, uv, faces = _ball(1.0)
+    at, normal, uv, faces = _ball(1.0, 4)
     found = vertex_curvature(at * radius, normal, uv, faces)
     band = np.abs(at[:, 2]) < 0.8
     # The mean width of a tile by area: 2 pi r / 4 cos(latitude), whose mean is pi / 4 of that.
