@@ -183,6 +183,8 @@ def recorded(
 ) -> BTF:
     """The BTF of a source with the record of where it came from; no texture is decoded yet.
 
+    Warns of a source without a light above the surface, and of a window beyond its textures.
+
     Args and errors: as of `ingest`.
     """
     told = phase or (lambda name: None)
@@ -192,7 +194,9 @@ def recorded(
     settled = {"texel_mm": given.pop("texel_mm")} if _outside(name, given, "texel_mm") else {}
     btf = replace(io.open(source, format=name, **given), **settled)
     taken = part or Part()
-    btf = taken.of(btf)
+    _warn_of_lights_below(source, btf)
+    whole, btf = btf, taken.of(btf)
+    _warn_of_cut_window(source, taken, whole)
     told("hashing")
     provenance = {
         **btf.provenance,
@@ -262,6 +266,27 @@ def source_hash(source: Location) -> dict[str, Any]:
         digest.update(file.read())
         digest.update(str(size).encode())
     return {"sha256": digest.hexdigest(), "of": "first and last 64 MiB, size", "bytes": size}
+
+
+def _warn_of_lights_below(source: str | os.PathLike[str] | Remote, btf: BTF) -> None:
+    if not (btf.light[:, 2] > 0).any():
+        warnings.warn(
+            f"{source}: none of {len(btf)} pairs is lit from above the horizon (z > 0); z points "
+            "away from the surface and directions towards the light: check their signs",
+            stacklevel=3,
+        )
+
+
+def _warn_of_cut_window(source: str | os.PathLike[str] | Remote, part: Part, whole: BTF) -> None:
+    _, h, w, _ = whole.shape
+    for name, asked, size in (("rows", part.rows, h), ("columns", part.cols, w)):
+        if asked.stop is not None and asked.stop > size:
+            start, stop, _ = asked.indices(size)
+            warnings.warn(
+                f"{source}: {name} {start}:{asked.stop} of a {h} x {w} texture are cut to "
+                f"{start}:{stop}",
+                stacklevel=3,
+            )
 
 
 def _outside(format: str, given: Mapping[str, Any], option: str) -> bool:

@@ -359,6 +359,27 @@ def test_the_command_line_takes_the_same_part(name: str, tmp_path: Path, capsys:
     )
 
 
+def test_a_window_beyond_the_textures_is_cut_with_a_warning(tmp_path: Path) -> None:
+    path = sources.SOURCES["lp"](tmp_path)
+    _, h, w, _ = btfkit.open(path).shape
+    with pytest.warns(UserWarning, match=rf"rows 1:99 of a {h} x {w} texture are cut to 1:{h}$"):
+        out = ingest(path, tmp_path / "a.btf.zarr", part=Part(slice(1, 99), slice(0, w)))
+    assert btfkit.open(out).shape[1:3] == (h - 1, w)
+
+
+def test_a_source_lit_from_below_alone_is_warned_of(tmp_path: Path) -> None:
+    path = sources.SOURCES["lp"](tmp_path)
+    (file,) = path.glob("*.lp")
+    first, *lines = file.read_text().splitlines()
+    named = [line.rsplit(maxsplit=1) for line in lines]
+    file.write_text("\n".join([first, *(f"{start} {-float(z)}" for start, z in named)]))
+    with pytest.warns(UserWarning, match="none of 4 pairs is lit from above .* check their signs"):
+        ingest(path, tmp_path / "a.btf.zarr")
+    file.write_text("\n".join([first, *lines[:1], *(f"{s} {-float(z)}" for s, z in named[1:])]))
+    # One light above is enough; warnings are errors here.
+    ingest(path, tmp_path / "b.btf.zarr")
+
+
 def test_the_source_is_recorded_with_its_hash_and_what_was_given(tmp_path: Path) -> None:
     path = sources.SOURCES["ubo2003"](tmp_path)
     out = ingest(path, tmp_path / "a.btf.zarr", options={"transfer": "2.2", "texel_mm": 0.1})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, final
@@ -42,11 +43,13 @@ class Found:
     Attributes:
         adjustment: the geometry and how well it is known. single: the camera by itself.
         slip_sd: how far axes stand from their readings, rms, radians or mm.
+        left_out: target frames that show too few corners to tell the camera.
     """
 
     adjustment: Adjustment
     single: SingleCamera
     slip_sd: Mapping[str, float]
+    left_out: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -56,6 +59,7 @@ class Found:
             "single_camera": {
                 "residual_px": self.single.residual_px,
                 "rejected": self.single.rejected,
+                "left_out": list(self.left_out),
                 "camera": self.single.camera.to_json(),
             },
         }
@@ -87,6 +91,7 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
     bare = replace(start, lights_mm={}, spheres_mm=np.zeros((0, 3)), radii_mm=np.zeros(0))
     alone = adjust(bare, sightings).geometry
     sightings = _seen_again(pictures, frames, board, alone, single.blur_px)
+    warn_of_unseen(frames, sightings)
     slip_sd = slips_of(alone, sightings)
     first_fit = adjust(alone, sightings, slip_sd=slip_sd)
     rough = replace(
@@ -103,7 +108,21 @@ def fit_geometry(sequence: Sequence, radiometry: Radiometry) -> Found:
         )
     ]
     found = adjust(rough, sightings, spheres, slip_sd=slip_sd) if spheres else first_fit
-    return Found(found, single, slip_sd)
+    seen = zip(frames, single.views, strict=True)
+    left_out = tuple(frame.file for frame, view in seen if view is None)
+    return Found(found, single, slip_sd, left_out)
+
+
+def warn_of_unseen(frames: list[Frame], sightings: list[Sighting]) -> None:
+    """Say which target frames tell nothing of the rig."""
+    seen = {sighting.name for sighting in sightings}
+    unseen = [frame.file for frame in frames if frame.file not in seen]
+    if unseen:
+        warnings.warn(
+            f"{len(unseen)} of {len(frames)} target frames show fewer than {_FEWEST_CORNERS} "
+            f"corners of the board and are left out, first {unseen[0]!r}",
+            stacklevel=3,
+        )
 
 
 def _cell_px(start: Geometry, board: Board, frame: Frame) -> float:

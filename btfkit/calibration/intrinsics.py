@@ -6,7 +6,7 @@ where a homography that knows no distortion expects them, and what does not fit 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -25,6 +25,8 @@ _REJECT = 5.0
 # A robust spread below this is the arithmetic's, not the detector's, px.
 _LEAST_PX = 0.01
 _FEWEST_VIEWS = 3
+# Of a view: OpenCV takes no pose from fewer corners, nor from any number of them in one row.
+_FEWEST_CORNERS = 6
 _ROUNDS = 2
 _BLUR_VIEWS = 3
 # Pixels that a cell of a marker needs to be read: on drawn boards of three dictionaries all markers
@@ -61,7 +63,7 @@ class SingleCamera:
 
     Attributes:
         camera: the estimate. sd: (9,) standard deviations of its parameters.
-        views: one a frame, None where the board was not found.
+        views: one a frame, None where fewer than six corners are found that fit, or one row.
         residual_px: rms of what was kept. rejected: corners that did not fit.
         blur_px: standard deviation of the lens's blur that corners were fitted with.
     """
@@ -94,45 +96,56 @@ def calibrate_camera(
             takes what a board that fills the frame would have.
 
     Raises:
-        CalibrationError: fewer than three frames show the board, or their views are too alike.
+        CalibrationError: fewer than three frames show six corners that fit, or their views are too
+            alike.
     """
-    found = [board.detect(image) for image in images]
-    usable = [i for i, (numbers, _) in enumerate(found) if len(numbers)]
-    if len(usable) < _FEWEST_VIEWS:
-        raise _unseen(images, board, len(usable), cell_px)
-    height, width = images[0].shape
+
+    def posed(views: Mapping[int, View]) -> dict[int, View]:
+        """Those by frame that have a pose to tell, once they are enough."""
+        told = {i: view for i, view in views.items() if _tells_pose(view, board)}
+        if len(told) < _FEWEST_VIEWS:
+            raise _unseen(images, board, len(told), cell_px)
+        return told
+
     blank = Rigid.identity()
-    views = [View(*found[i], blank) for i in usable]
+    views = posed({i: View(*board.detect(image), blank) for i, image in enumerate(images)})
+    height, width = images[0].shape
     camera, views, sd = _solve(views, board, width, height)
-    _refuse_parallel(views)
-    camera, views, sd, rejected = _settled(views, board, width, height)
+    _refuse_parallel(list(views.values()))
+    camera, views, sd, rejected = _settled(views, board, width, height, posed)
     if blur_px is None:
-        squarest = np.argsort([-abs(view.pose.rotation[2, 2]) for view in views])[:_BLUR_VIEWS]
+        squarest = sorted(views, key=lambda i: -abs(views[i].pose.rotation[2, 2]))[:_BLUR_VIEWS]
         blurs = [
-            corners.blur_of(board, images[usable[v]], views[v].numbers, camera, views[v].pose)
-            for v in squarest
+            corners.blur_of(board, images[i], views[i].numbers, camera, views[i].pose)
+            for i in squarest
         ]
         blur_px = float(np.median(blurs))
     every = np.arange(len(board.corners_mm))
     for turn in range(_ROUNDS):
         # All corners that frames may show, those that detection missed among them; then the good.
-        views = [
-            _refined(images[i], view, every if turn == 0 else view.numbers, board, camera, blur_px)
-            for i, view in zip(usable, views, strict=True)
-        ]
-        camera, views, sd, rejected = _settled(views, board, width, height)
+        views = {
+            i: _refined(
+                images[i], view, every if turn == 0 else view.numbers, board, camera, blur_px
+            )
+            for i, view in views.items()
+        }
+        camera, views, sd, rejected = _settled(views, board, width, height, posed)
     if max(sd[:2] / camera.parameters[:2]) > _FOCAL_SD:
         raise CalibrationError(
             f"the focal length comes as {camera.parameters[0]:.1f} ± {sd[0]:.1f} px: the views are "
             "too alike",
             remedy="add views tilted by 30 degrees and more, about two axes",
         )
-    residual = np.concatenate([_residuals(camera, view, board) for view in views])
+    residual = np.concatenate([_residuals(camera, view, board) for view in views.values()])
     rms = float(np.sqrt((residual**2).sum(1).mean()))
-    by_frame: list[View | None] = [None] * len(images)
-    for i, view in zip(usable, views, strict=True):
-        by_frame[i] = view
-    return SingleCamera(camera, sd, tuple(by_frame), rms, rejected, blur_px)
+    by_frame = tuple(views.get(i) for i in range(len(images)))
+    return SingleCamera(camera, sd, by_frame, rms, rejected, blur_px)
+
+
+def _tells_pose(view: View, board: Board) -> bool:
+    """Whether a view has corners enough, and they do not lie in one row."""
+    points = board.corners_mm[view.numbers]
+    return len(points) >= _FEWEST_CORNERS and np.linalg.matrix_rank(points - points[0]) == 2
 
 
 def _unseen(
@@ -141,8 +154,12 @@ def _unseen(
     """Why the board is not found: markers of too few pixels, else the description or the light."""
     said = (
         f"the board is seen in {seen} of {len(images)} frames; at least {_FEWEST_VIEWS} are needed"
+        f", {_FEWEST_CORNERS} corners in each that fit and are not in one row"
     )
-    remedy = "check target.board of sequence.json and the exposure of the target frames"
+    remedy = (
+        "check target.board of sequence.json, the exposure of the target frames and how much of "
+        "them the board fills"
+    )
     if len(images):
         height, width = images[0].shape
         cell = board.most_cell_px(width, height)
@@ -175,43 +192,54 @@ def _refined(
     """The view with corners fitted to the frame, those of `numbers` that it shows."""
     pixels, _ = corners.refine(board, image, numbers, camera, view.pose, blur_px=blur_px)
     good = np.isfinite(pixels).all(axis=1)
-    if good.sum() < 4:
+    if good.sum() < _FEWEST_CORNERS:
         return view
     return View(numbers[good], pixels[good], view.pose)
 
 
 def _settled(
-    views: list[View], board: Board, width: int, height: int
-) -> tuple[Camera, list[View], Floats, int]:
-    """Solve, reject what is far off, solve again, until nothing is."""
-    before = sum(len(view.numbers) for view in views)
+    views: dict[int, View],
+    board: Board,
+    width: int,
+    height: int,
+    posed: Callable[[Mapping[int, View]], dict[int, View]],
+) -> tuple[Camera, dict[int, View], Floats, int]:
+    """Solve, reject what is far off, solve again, until nothing is.
+
+    Views that this leaves too little of go as a whole: `posed` says which stay.
+    """
+    before = sum(len(view.numbers) for view in views.values())
     while True:
         camera, views, sd = _solve(views, board, width, height)
-        residuals = [np.abs(_residuals(camera, view, board)).max(axis=1) for view in views]
-        spread = max(1.4826 * float(np.median(np.concatenate(residuals))), _LEAST_PX)
+        residuals = [np.abs(_residuals(camera, view, board)).max(axis=1) for view in views.values()]
+        # Corners that the camera would have behind it fit nowhere.
+        every = np.concatenate(residuals)
+        typical = float(np.median(every[np.isfinite(every)])) if np.isfinite(every).any() else 0.0
+        spread = max(1.4826 * typical, _LEAST_PX)
         keep = [r < _REJECT * spread for r in residuals]
-        # A view is not taken below what gives its pose: four corners.
-        keep = [k if k.sum() >= 4 else np.ones_like(k) for k in keep]
         if all(k.all() for k in keep):
             break
-        views = [view.keep(k) for view, k in zip(views, keep, strict=True)]
-    return camera, views, sd, before - sum(len(view.numbers) for view in views)
+        kept = zip(views.items(), keep, strict=True)
+        views = posed({i: view.keep(k) for (i, view), k in kept})
+    return camera, views, sd, before - sum(len(view.numbers) for view in views.values())
 
 
 def _solve(
-    views: list[View], board: Board, width: int, height: int
-) -> tuple[Camera, list[View], Floats]:
+    views: dict[int, View], board: Board, width: int, height: int
+) -> tuple[Camera, dict[int, View], Floats]:
     import cv2
 
-    objects = [board.corners_mm[view.numbers].astype(np.float32) for view in views]
-    pixels = [view.pixels.astype(np.float32) for view in views]
+    objects = [board.corners_mm[view.numbers].astype(np.float32) for view in views.values()]
+    pixels = [view.pixels.astype(np.float32) for view in views.values()]
     try:
         _, matrix, numbers, turns, shifts, deviations, _, _ = cv2.calibrateCameraExtended(
             objects, pixels, (width, height), None, None, flags=cv2.CALIB_FIX_K3
         )
     except cv2.error as error:
+        fewest = min(len(view.numbers) for view in views.values())
         raise CalibrationError(
-            f"OpenCV finds no camera for {len(views)} views of the board: {error.err}",
+            f"OpenCV finds no camera for {len(views)} views of the board, of {fewest} corners and "
+            f"more: {' '.join(error.err.split())}",
             remedy="add views tilted by 30 degrees and more, about two axes",
         ) from error
     values = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *numbers.reshape(-1)[:5]]
@@ -220,7 +248,8 @@ def _solve(
         Rigid.from_vectors(turn.reshape(3), shift.reshape(3))
         for turn, shift in zip(turns, shifts, strict=True)
     ]
-    views = [replace(view, pose=pose) for view, pose in zip(views, poses, strict=True)]
+    solved = zip(views.items(), poses, strict=True)
+    views = {i: replace(view, pose=pose) for (i, view), pose in solved}
     return camera, views, np.asarray(deviations, float).reshape(-1)[: len(PARAMETERS)]
 
 

@@ -7,13 +7,13 @@ import turntables
 from kornia.geometry.calibration import distort_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
-from btfkit.calibration import bundle_parameters
+from btfkit.calibration import bundle_parameters, corners
 from btfkit.calibration.board import Board
 from btfkit.calibration.bundle import Sighting, SphereSighting, adjust
 from btfkit.calibration.bundle_problem import Problem
 from btfkit.calibration.camera_model import Camera
 from btfkit.calibration.geometry import Geometry
-from btfkit.calibration.geometry_stage import LAMP, find_highlights
+from btfkit.calibration.geometry_stage import LAMP, find_highlights, warn_of_unseen
 from btfkit.calibration.intrinsics import calibrate_camera
 from btfkit.calibration.kinematics import Axis, Kinematics, Rigid
 from btfkit.calibration.mirrors import highlight
@@ -435,12 +435,78 @@ def test_frames_without_a_board_are_refused_with_their_number():
     with pytest.raises(CalibrationError, match=r"is 17\.5 pixels wide, 2\.5 for"):
         calibrate_camera(blank, BOARD, cell_px=[2.5, 2.4, np.nan, 2.6])
     for enough in ([5.0] * 4, [np.nan] * 4):
-        with pytest.raises(CalibrationError, match=r"are needed; check target\.board"):
+        with pytest.raises(CalibrationError, match=r"in one row; check target\.board"):
             calibrate_camera(blank, BOARD, cell_px=enough)
     rig = turntables.Turntable(np.random.default_rng(0))
     two = sightings(rig, [readings(0), readings(5)], 0, np.random.default_rng(0))
     with pytest.raises(CalibrationError, match="2 frames show known points"):
         adjust(nominal(rig), two)
+
+
+def test_views_of_too_few_corners_are_left_out_and_too_few_views_refused(monkeypatch):
+    rng = np.random.default_rng(12)
+    rig = turntables.Turntable(rng)
+    ahead = (readings(k) for k in range(9))
+    pixels = [
+        turntables.project(turntables.apply(rig.sample_to_camera(at["tilt"], at["turn"]), turntables.corners()))
+        for at in ahead
+    ]  # fmt: skip
+    row, some, off = np.arange(7), np.arange(12), pixels[2].copy()
+    # Five corners stay where they are: what does not fit must not be what a pose is told by.
+    off[5:12] += rng.uniform(20, 60, (7, 2))
+    few = [(row, pixels[0][row]), (some[:5], pixels[1][:5]), (some, off[some])]
+    every = [(np.arange(48), seen) for seen in pixels[3:]]
+
+    def found(detected):
+        views = iter(detected)
+        monkeypatch.setattr(Board, "detect", lambda self, image: next(views))
+        # Blank frames: nothing is fitted again.
+        lost = np.full((48, 2), np.nan)
+        monkeypatch.setattr(corners, "refine", lambda *args, **options: (lost, lost))
+        blank = [np.zeros((turntables.HEIGHT, turntables.WIDTH))] * len(detected)
+        return calibrate_camera(blank, BOARD, blur_px=0.5, cell_px=[5.0] * len(detected))
+
+    single = found([*few, *every])
+    assert [view is None for view in single.views] == [True] * 3 + [False] * 6
+    # Corners stay as they were projected, exact to float32.
+    assert single.residual_px < 1e-3
+    with pytest.raises(
+        CalibrationError,
+        match=r"seen in 2 of 5 frames; at least 3 are needed, 6 corners in each that fit .* row; check",
+    ):
+        found([*few, *every[:2]])
+
+
+def test_target_frames_that_tell_nothing_are_named():
+    frames = [Frame(f"{k}.png", "target") for k in range(3)]
+    seen = [Sighting(f"{k}.png", {}, np.zeros((6, 3)), np.zeros((6, 2))) for k in range(3)]
+    warn_of_unseen(frames, seen)
+    with pytest.warns(
+        UserWarning, match=r"2 of 3 target frames show fewer than 6 .* first '0\.png'"
+    ):
+        warn_of_unseen(frames, seen[1:2])
+
+
+def test_what_opencv_refuses_is_told_in_one_line(monkeypatch):
+    import cv2
+
+    rig = turntables.Turntable(np.random.default_rng(12))
+    seen = turntables.project(
+        turntables.apply(rig.sample_to_camera(0.5, 0.3), turntables.corners())
+    )
+
+    def refuse(*args, **options):
+        error = cv2.error("all of it")
+        error.err = "too few points where\n    'count' is 5\nmust be\n    '6'"
+        raise error
+
+    monkeypatch.setattr(cv2, "calibrateCameraExtended", refuse)
+    monkeypatch.setattr(Board, "detect", lambda self, image: (np.arange(48), seen))
+    with pytest.raises(
+        CalibrationError,
+        match=r"3 views of the board, of 48 corners and more: .*'count' is 5 must be '6'",
+    ):
+        calibrate_camera([np.zeros((turntables.HEIGHT, turntables.WIDTH))] * 3, BOARD)
 
 
 @pytest.mark.slow
