@@ -154,7 +154,8 @@ def _processes(count: int) -> Any:
         n_workers=count,
         threads_per_worker=1,
         processes=True,
-        dashboard_address=None,
+        # None would take Dask's own port all the same, which another cluster may have.
+        dashboard_address=":0",
         silence_logs=logging.CRITICAL,
         env=dict.fromkeys(_THREADS, each),
     )
