@@ -9,8 +9,9 @@ import struct
 import time
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -161,46 +162,42 @@ def _coefficients(path: Path) -> None:
     path.write_bytes(data)
 
 
-def _area(folder: Path) -> None:
-    path = folder / "sequence.json"
+@contextlib.contextmanager
+def _edited(path: Path) -> Iterator[Any]:
+    """A JSON document, written back as it is then."""
     told = json.loads(path.read_text())
-    told["target"]["sample"]["size_mm"] = [7, [[5]]]
+    yield told
     path.write_text(json.dumps(told))
+
+
+def _area(folder: Path) -> None:
+    with _edited(folder / "sequence.json") as told:
+        told["target"]["sample"]["size_mm"] = [7, [[5]]]
 
 
 def _sample(folder: Path) -> None:
-    path = folder / "sequence.json"
-    told = json.loads(path.read_text())
-    told["target"]["sample"] = []
-    path.write_text(json.dumps(told))
+    with _edited(folder / "sequence.json") as told:
+        told["target"]["sample"] = []
 
 
 def _direction(folder: Path) -> None:
-    path = folder / "sequence.json"
-    told = json.loads(path.read_text())
-    told["rig"]["axes"][0]["direction"] = [0, 1e308, 1e308]
-    path.write_text(json.dumps(told))
+    with _edited(folder / "sequence.json") as told:
+        told["rig"]["axes"][0]["direction"] = [0, 1e308, 1e308]
 
 
 def _rotation(folder: Path) -> None:
-    path = folder / "sequence.json"
-    told = json.loads(path.read_text())
-    told["rig"]["camera"]["rotation"][0][2] = 1e12
-    path.write_text(json.dumps(told))
+    with _edited(folder / "sequence.json") as told:
+        told["rig"]["camera"]["rotation"][0][2] = 1e12
 
 
 def _no_rotation(folder: Path) -> None:
-    path = folder / "sequence.json"
-    told = json.loads(path.read_text())
-    told["rig"]["camera"]["rotation"] = [[2, 0, 0], [0, -2, 0], [0, 0, -2]]
-    path.write_text(json.dumps(told))
+    with _edited(folder / "sequence.json") as told:
+        told["rig"]["camera"]["rotation"] = [[2, 0, 0], [0, -2, 0], [0, 0, -2]]
 
 
 def _away(folder: Path) -> None:
-    path = folder / "sequence.json"
-    told = json.loads(path.read_text())
-    told["rig"]["camera"]["rotation"] = np.eye(3).tolist()
-    path.write_text(json.dumps(told))
+    with _edited(folder / "sequence.json") as told:
+        told["rig"]["camera"]["rotation"] = np.eye(3).tolist()
 
 
 def _name(folder: Path) -> None:
@@ -221,31 +218,23 @@ def _signal(path: Path) -> None:
 
 
 def _no_run(folder: Path) -> None:
-    path = folder / "texture" / "zarr.json"
-    told = json.loads(path.read_text())
-    told["chunk_grid"]["configuration"]["chunk_shape"][0] = 0
-    path.write_text(json.dumps(told))
+    with _edited(folder / "texture" / "zarr.json") as told:
+        told["chunk_grid"]["configuration"]["chunk_shape"][0] = 0
 
 
 def _endless(folder: Path) -> None:
-    path = folder / "sequence.json"
-    told = json.loads(path.read_text())
-    told["target"]["sample"]["size_mm"] = [7, 10**12]
-    path.write_text(json.dumps(told))
+    with _edited(folder / "sequence.json") as told:
+        told["target"]["sample"]["size_mm"] = [7, 10**12]
 
 
 def _far(folder: Path) -> None:
-    path = folder / "sequence.json"
-    told = json.loads(path.read_text())
-    told["rig"]["axes"][0]["point_mm"] = [1e308, 0, 0]
-    path.write_text(json.dumps(told))
+    with _edited(folder / "sequence.json") as told:
+        told["rig"]["axes"][0]["point_mm"] = [1e308, 0, 0]
 
 
 def _shard(folder: Path) -> None:
-    path = folder / "texture" / "zarr.json"
-    told = json.loads(path.read_text())
-    told["chunk_grid"]["configuration"]["chunk_shape"][1] *= 2
-    path.write_text(json.dumps(told))
+    with _edited(folder / "texture" / "zarr.json") as told:
+        told["chunk_grid"]["configuration"]["chunk_shape"][1] *= 2
 
 
 def _frame(folder: Path) -> None:
