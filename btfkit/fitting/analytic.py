@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from btfkit.btf import BTF, RGB, Wrap
 from btfkit.native.lobe import Lobes, Start, better, fit_lobes, shaded
-from btfkit.relief.photometric import normal_of, rank_window
+from btfkit.relief.photometric import normal_of, starts
 from btfkit.relief.relief import Relief
 from btfkit.relief.stack import Stack, read_stack, visibility
 
@@ -23,8 +23,6 @@ Array = NDArray[np.float32]
 Floats = NDArray[Any]
 Mask = NDArray[np.bool_]
 
-# What gloss is taken for where data do not say; two starts, since a lobe has two valleys.
-_GLOSS, _ROUGHNESS = 0.04, (0.25, 0.6)
 _MOST_VALUES = 1 << 23
 # Pairs that a texel's lobe is fitted to.
 _MOST_PAIRS = 400
@@ -163,32 +161,18 @@ def _rows(
     place = stack.place(height, rows)
     with np.errstate(invalid="ignore"):
         grey: Array = values @ np.full(values.shape[2], 1 / values.shape[2], np.float32)
-    starts = _starts(stack, grey, weight, place)
+    firsts = starts(stack, grey, weight, place)
     if given is not None:
-        starts = [start._replace(slope=given) for start in starts]
-    lobes = _fitted(stack, values, weight, place, starts, given is None)
+        firsts = [first._replace(slope=given) for first in firsts]
+    lobes = _fitted(stack, values, weight, place, firsts, given is None)
     bright = np.where(weight > 0, grey, 0).sum(axis=1) / np.maximum((weight > 0).sum(axis=1), 1)
     return lobes, bright.astype(np.float32), (weight > 0).sum(axis=1).astype(np.float32)
 
 
-def _starts(stack: Stack, grey: Array, weight: Array, place: Array) -> list[Start]:
-    """A narrow lobe and a wide one on the slopes of the window of ranks."""
-    towards: Floats = stack.light
-    if stack.light_near is not None:
-        rays = stack.light_near[None] - place[:, None]
-        towards = rays / np.linalg.norm(rays, axis=2, keepdims=True)
-    slope, albedo = rank_window(grey, weight, towards)
-    gloss = np.full((len(grey), 1), _GLOSS, np.float32)
-    return [
-        Start(slope, np.full(len(grey), roughness, np.float32), albedo[:, None], gloss)
-        for roughness in _ROUGHNESS
-    ]
-
-
 def _fitted(
-    stack: Stack, values: Array, weight: Array, place: Array, starts: Sequence[Start], free: bool
+    stack: Stack, values: Array, weight: Array, place: Array, firsts: Sequence[Start], free: bool
 ) -> Lobes:
-    """The best of the fits from `starts`, whose albedo and specular are (t, 1), grey."""
+    """The best of the fits from `firsts`, whose albedo and specular are (t, 1), grey."""
     near = stack.light_near is not None, stack.view_near is not None
     light = stack.light if stack.light_near is None else stack.light_near
     view = stack.view if stack.view_near is None else stack.view_near
@@ -202,7 +186,7 @@ def _fitted(
         )
 
     found: Lobes | None = None
-    for start in starts:
+    for start in firsts:
         wide = (np.repeat(grey, count, axis=1) for grey in (start.albedo, start.specular))
         other = fit(part, Start(start.slope, start.roughness, *wide), slopes=free, rough=True)
         found = other if found is None else better(found, other)

@@ -27,7 +27,7 @@ LOW_RANK, HIGH_RANK = 0.3, 0.8
 # plane with the sample: normals along it are free.
 _FLATTEST_SPAN = 0.02
 # What gloss is taken for where the data do not say.
-_GLOSS, _ROUGHNESS = 0.04, 0.4
+_GLOSS, _ROUGHNESS = 0.04, (0.25, 0.6)
 _STEEPEST = 0.05
 # Pairs count by this power of the view's cosine: measured, see docs/heightfields.md.
 _UPRIGHT = 2.0
@@ -201,25 +201,31 @@ def _weights(values: Array, visible: NDArray[np.bool_] | None, rows: slice) -> A
     return weight
 
 
+def starts(stack: Stack, grey: Array, weight: Array, place: Array) -> list[Start]:
+    """A narrow lobe and a wide one, two valleys of the error, on slopes of the window of ranks.
+
+    Args:
+        grey: (t, n) of t texels. weight: (t, n). place: (t, 3) of the texels.
+    """
+    towards: Floats = stack.light
+    if stack.light_near is not None:
+        rays = stack.light_near[None] - place[:, None]
+        towards = rays / np.linalg.norm(rays, axis=2, keepdims=True)
+    slope, albedo = rank_window(grey, weight, towards)
+    gloss = np.full((len(grey), 1), _GLOSS, np.float32)
+    return [
+        Start(slope, np.full(len(grey), roughness, np.float32), albedo[:, None], gloss)
+        for roughness in _ROUGHNESS
+    ]
+
+
 def _fitted(stack: Stack, values: Array, weight: Array, place: Array, begin: Start | None) -> Lobes:
     near = stack.light_near is not None, stack.view_near is not None
     light = stack.light if stack.light_near is None else stack.light_near
     view = stack.view if stack.view_near is None else stack.view_near
-    towards: Floats = light
-    if near[0]:
-        rays = light[None] - place[:, None]
-        towards = rays / np.linalg.norm(rays, axis=2, keepdims=True)
-    if begin is not None:
-        return fit_lobes(values, weight, light, view, begin, place=place, near=near)
-    slope, albedo = rank_window(values[..., 0], weight, towards)
-    t = len(values)
+    firsts = starts(stack, values[..., 0], weight, place) if begin is None else [begin]
     best: Lobes | None = None
-    # A narrow lobe and a wide one are two valleys of the error.
-    for roughness in (0.25, 0.6):
-        first = Start(
-            slope, np.full(t, roughness, np.float32), albedo[:, None],
-            np.full((t, 1), _GLOSS, np.float32),
-        )  # fmt: skip
+    for first in firsts:
         found = fit_lobes(values, weight, light, view, first, place=place, near=near)
         best = found if best is None else better(best, found)
     assert best is not None
